@@ -1,0 +1,58 @@
+"""The worlds: batched goal-reaching tasks on numpy and MuJoCo; nothing of learning in them.
+
+`make` builds one by name; `GoalEnv` in `goalgan_bt.envs.batch` is the contract.
+"""
+
+from pathlib import Path
+
+from goalgan_bt.envs import maze as mazes
+from goalgan_bt.envs.ant_maze import AntMaze
+from goalgan_bt.envs.batch import GoalEnv
+from goalgan_bt.envs.point_maze import PointMaze
+from goalgan_bt.envs.point_nd import PointND
+
+BODIES = {"point": (PointMaze, 200), "ant": (AntMaze, 500)}  # horizon in the U-maze, steps
+NAMES = (*(f"{body}_{layout}" for body in BODIES for layout in mazes.LAYOUTS), "point_nd")
+
+
+def make(
+    name: str,
+    num_envs: int,
+    *,
+    threads: int = 0,
+    horizon: int | None = None,
+    integrator: str = "implicitfast",
+    dim: int = 2,
+    map_file: Path | None = None,
+) -> GoalEnv:
+    """N simulations of the environment of that name.
+
+    Args:
+        name: one of `NAMES`.
+        num_envs: N.
+        threads: simulation threads, 0 for one per core.
+        horizon: steps of an episode. If None: 200 for a point and 500 for an Ant in the U-maze,
+            and in other mazes more, in proportion to the longest way from the start.
+        integrator: `implicitfast` or `rk4`, for MuJoCo bodies.
+        dim: dimensions of `point_nd`, 2 to 6.
+        map_file: a text map that replaces the layout (see `goalgan_bt.envs.maze`).
+
+    Raises:
+        ValueError: for an unknown name or a dim out of range.
+        MapError: for a map that is not a maze.
+    """
+    if name not in NAMES:
+        raise ValueError(f"unknown environment {name!r}: choose one of {', '.join(NAMES)}")
+    if name == "point_nd":
+        if not 2 <= dim <= 6:
+            raise ValueError(f"point_nd has 2 to 6 dimensions, not {dim}")
+        return PointND(dim, num_envs, horizon or 200)
+    body, layout = name.split("_")
+    constructor, base_horizon = BODIES[body]
+    maze = mazes.layout(layout) if map_file is None else mazes.load(map_file)
+    if horizon is None:
+        scale = maze.longest_path / mazes.layout("umaze").longest_path
+        horizon = max(base_horizon, 100 * round(base_horizon * scale / 100))
+    env = constructor(maze, num_envs, horizon, threads, integrator)
+    env.name = name if map_file is None else f"{body}_{map_file.stem}"
+    return env

@@ -1,0 +1,143 @@
+"""The Ant in a maze: the original's physics on the body that gymnasium ships.
+
+One step of 0.02 s per action, torques of at most 150 N m, no reset noise, success when the centre
+of mass comes within 1 m of the goal, and an end without reward when the torso leaves 0.3 to 1.0 m
+of height (Florensa et al. 2018). Contact-force observations are left out: they are zero or
+redundant.
+"""
+
+from pathlib import Path
+
+import gymnasium
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from goalgan_bt.envs.batch import INTEGRATORS, MujocoEnv, add_walls
+from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
+
+TORSO_RADIUS = 0.25  # m
+LEG_RADIUS = 0.08  # m
+HEALTHY_Z = (0.3, 1.0)  # m, height of the torso
+# Where each leg leaves the torso; hips turn about z, ankles about the horizontal normal.
+LEGS = 0.2 * np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])  # (4, 2) m
+
+
+def build_model(maze: Maze, integrator: str = "implicitfast") -> mujoco.MjModel:
+    """gymnasium's Ant with the original's step, contacts and walls of 1 m."""
+    path = Path(gymnasium.__file__).parent / "envs/mujoco/assets/ant.xml"
+    spec = mujoco.MjSpec.from_file(str(path))
+    spec.option.timestep = 0.02
+    spec.option.integrator = INTEGRATORS[integrator]
+    add_walls(spec, maze, height=1.0, collide=True)
+    for geom in spec.geoms:
+        geom.solref[:2] = [0.02, 1.0]
+        geom.solimp[:3] = [0.8, 0.8, 0.01]
+    # The original's contacts are soft: at full force the torso sinks 5 cm into a wall. A margin
+    # makes them act 10 cm early for the torso alone, so that it stays out at any speed reached.
+    spec.geom("torso_geom").margin = 0.1
+    return spec.compile()
+
+
+class AntMaze(MujocoEnv):
+    """Walk to any point of a maze; success within 1 m.
+
+    State: qpos (15: x, y, z in m, torso quaternion w, x, y, z, joint angles in rad) and qvel
+    (14). Observation: the state, the offset from the centre of mass to the desired goal, and the
+    same offset in the torso's heading, 33 numbers. Achieved goal: x, y of the centre of mass.
+    """
+
+    success_radius = 1.0
+    act_dim = 8
+    obs_dim = 33
+    start_state = np.array([0, 0, 0.55, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1] + [0] * 14, float)
+
+    def __init__(
+        self,
+        maze: Maze,
+        num_envs: int,
+        horizon: int,
+        threads: int = 0,
+        integrator: str = "implicitfast",
+    ) -> None:
+        self.maze = maze
+        self.goal_low, self.goal_high = maze.low, maze.high
+        super().__init__(build_model(maze, integrator), num_envs, horizon, threads)
+        self._maze = maze
+        mass = self.model.body_mass
+        first = self.model.body("front_left_leg").id  # upper leg (fixed), lower leg, foot
+        self._leg_share, self._foot_share = mass[first + 1 : first + 3] / mass.sum()
+
+    def observations(self, states: FloatArray, goals: FloatArray) -> NDArray[np.float32]:
+        offset = goals - self.achieved_goals(states)
+        forward = _rotate(states[:, 3:7], np.array([1.0, 0.0, 0.0]))[:, :2]
+        forward /= np.linalg.norm(forward, axis=1, keepdims=True) + 1e-9
+        left = forward[:, ::-1] * (-1, 1)
+        heading = [(offset * axis).sum(axis=1, keepdims=True) for axis in (forward, left)]
+        return np.concatenate([states, offset, *heading], axis=1, dtype=np.float32)
+
+    def achieved_goals(self, states: FloatArray) -> FloatArray:
+        """Centre of mass of the whole Ant, (n, 2): what MuJoCo calls the torso's subtree_com."""
+        knees, feet = self._joints(states)
+        # Each leg: a capsule from hip to knee and one from knee to foot; the rest is symmetric.
+        com = self._leg_share * (knees / 2 + LEGS_3D / 2).sum(axis=1)
+        com += self._foot_share * ((knees + feet) / 2).sum(axis=1)
+        return states[:, :2] + _rotate(states[:, 3:7], com)[:, :2]
+
+    def place(self, states: FloatArray, goals: FloatArray) -> FloatArray:
+        moved = states.copy()
+        moved[:, :2] += goals - self.achieved_goals(states)
+        return moved
+
+    def healthy(self, states: FloatArray) -> BoolArray:
+        low, high = HEALTHY_Z
+        with np.errstate(invalid="ignore"):
+            upright = (states[:, 2] >= low) & (states[:, 2] <= high)
+        return np.asarray(upright & np.isfinite(states).all(axis=1))
+
+    def valid(self, states: FloatArray) -> BoolArray:
+        """Healthy, the torso a radius away from every wall, no knee or foot inside one."""
+        free = self.healthy(states)
+        for corner in TORSO_RADIUS * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]):
+            free &= self._maze.is_free(states[:, :2] + corner)
+        for joints in self._joints(states):
+            for leg in range(len(LEGS)):
+                tip = states[:, :2] + _rotate(states[:, 3:7], joints[:, leg])[:, :2]
+                free &= self._maze.is_free(tip)
+        return free
+
+    def feasible(self, goals: FloatArray) -> BoolArray:
+        return self._maze.is_free(goals)
+
+    def test_goals(self) -> FloatArray:
+        return self._maze.tiles()
+
+    def repair(self, states: FloatArray) -> FloatArray:
+        """The torso's quaternion brought back to length 1."""
+        states = states.copy()
+        states[:, 3:7] /= np.linalg.norm(states[:, 3:7], axis=1, keepdims=True) + 1e-9
+        return states
+
+    def _joints(self, states: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Knees and feet in the torso's frame, each (n, 4, 3), metres."""
+        hip, ankle = states[:, 7:15:2], states[:, 8:15:2]  # (n, 4) rad
+        cos, sin = np.cos(hip), np.sin(hip)
+        x, y = LEGS.T
+        direction = np.stack([cos * x - sin * y, sin * x + cos * y, np.zeros_like(hip)], axis=-1)
+        knees = LEGS_3D + direction
+        lift = ANKLE_SIGN * np.sin(ankle) * np.linalg.norm(LEGS[0])
+        up = np.stack([np.zeros_like(lift), np.zeros_like(lift), lift], axis=-1)
+        feet = knees + 2 * (direction * np.cos(ankle)[..., None] + up)
+        return knees, feet
+
+
+LEGS_3D = np.concatenate([LEGS, np.zeros((4, 1))], axis=1)
+# A positive ankle angle lowers the feet 1 and 4 and lifts the feet 2 and 3.
+ANKLE_SIGN = np.array([-1.0, 1.0, 1.0, -1.0])
+
+
+def _rotate(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
+    """Vectors turned by unit quaternions (w, x, y, z): (n, 4), (n, 3) or (3,) -> (n, 3)."""
+    w, u = quaternion[:, :1], quaternion[:, 1:]
+    t = 2 * np.cross(u, np.broadcast_to(vector, u.shape))
+    return vector + w * t + np.cross(u, t)

@@ -1,0 +1,235 @@
+"""Many simulations of one goal-reaching task, stepped at once.
+
+`GoalEnv` is the contract between the world and the learner; `MujocoEnv` adds MuJoCo's physics
+and is the only place that knows `mujoco.batch`.
+"""
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+from numpy.typing import NDArray
+
+from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
+
+Ids = NDArray[np.int64]
+
+
+class Step(NamedTuple):
+    """What one step of n simulations gave.
+
+    rewards: (n,) float32, 1 on reaching the goal, else 0.
+    terminated: (n,) bool, the goal was reached or the body failed (an Ant that fell).
+    truncated: (n,) bool, the time ran out without either.
+    """
+
+    rewards: NDArray[np.float32]
+    terminated: BoolArray
+    truncated: BoolArray
+
+
+class GoalEnv:
+    """N simulations of one body that must bring its achieved goal to a desired goal.
+
+    The reward is sparse: 1 on coming within `success_radius` of a feasible desired goal, else 0;
+    a goal inside a wall is never reached (Florensa et al. 2018, `only_feasible`). An episode ends
+    on success, on failure of the body, or after `horizon` steps. Nothing resets by itself.
+
+    A state is one float row that holds all that the physics needs; states can be read
+    (`states`), written (`reset`) and mapped to observations and achieved goals in batches of any
+    size, which the decoder and the backtracking model rely on.
+
+    Attributes:
+        name: for example `ant_umaze`.
+        num_envs: N.
+        horizon: steps of an episode; `dt`: seconds of a step.
+        success_radius: metres.
+        obs_dim, act_dim, goal_dim, state_dim: sizes of one row.
+        start_state: (state_dim,) where episodes begin.
+        goal_low, goal_high: (goal_dim,) the box in which goals are proposed, metres.
+        maze: the layout, or None where there are no walls.
+        goals: (N, goal_dim) the desired goals; elapsed: (N,) steps since the last reset.
+    """
+
+    name: str
+    dt: float
+    success_radius: float
+    act_dim: int
+    obs_dim: int
+    start_state: FloatArray
+    goal_low: FloatArray
+    goal_high: FloatArray
+    maze: Maze | None = None
+
+    def __init__(self, num_envs: int, horizon: int) -> None:
+        self.num_envs = num_envs
+        self.horizon = horizon
+        self.goals = np.zeros((num_envs, self.goal_dim))
+        self.elapsed = np.zeros(num_envs, dtype=np.int64)
+        self._feasible = np.zeros(num_envs, dtype=bool)
+
+    @property
+    def goal_dim(self) -> int:
+        """Size of a goal."""
+        return len(self.goal_low)
+
+    @property
+    def state_dim(self) -> int:
+        """Size of a state."""
+        return len(self.start_state)
+
+    # What a body defines. All take and return rows: (n, state_dim), (n, goal_dim), ...
+
+    def read_states(self, ids: Ids) -> FloatArray:
+        """A copy of the states of those simulations, (n, state_dim)."""
+        raise NotImplementedError
+
+    def write_states(self, ids: Ids, states: FloatArray) -> None:
+        """Put those simulations into those states, (n, state_dim)."""
+        raise NotImplementedError
+
+    def advance(self, ids: Ids, actions: FloatArray) -> None:
+        """Move those simulations by one step under actions in [-1, 1], (n, act_dim)."""
+        raise NotImplementedError
+
+    def observations(self, states: FloatArray, goals: FloatArray) -> NDArray[np.float32]:
+        """What the policy sees in those states with those desired goals, (n, obs_dim)."""
+        raise NotImplementedError
+
+    def achieved_goals(self, states: FloatArray) -> FloatArray:
+        """The goal that each state stands on, (n, goal_dim)."""
+        raise NotImplementedError
+
+    def place(self, states: FloatArray, goals: FloatArray) -> FloatArray:
+        """The same states moved so that they achieve those goals, (n, state_dim)."""
+        raise NotImplementedError
+
+    def healthy(self, states: FloatArray) -> BoolArray:
+        """Whether an episode may go on in each state, (n,)."""
+        raise NotImplementedError
+
+    def valid(self, states: FloatArray) -> BoolArray:
+        """Whether each state is healthy and outside the walls, (n,)."""
+        raise NotImplementedError
+
+    def feasible(self, goals: FloatArray) -> BoolArray:
+        """Whether each goal lies where the body can be, (n,)."""
+        raise NotImplementedError
+
+    def test_goals(self) -> FloatArray:
+        """The feasible goals over which coverage is measured, (K, goal_dim)."""
+        raise NotImplementedError
+
+    def repair(self, states: FloatArray) -> FloatArray:
+        """States with the constraints that a learned model breaks put right, (n, state_dim)."""
+        return states
+
+    # What all bodies share.
+
+    def reset(self, ids: Ids, goals: FloatArray, states: FloatArray | None = None) -> None:
+        """Begin new episodes in some simulations.
+
+        Args:
+            ids: sorted indices of the simulations, (n,).
+            goals: their desired goals, (n, goal_dim).
+            states: where they begin, (n, state_dim); the start state if None.
+        """
+        if states is None:
+            states = np.broadcast_to(self.start_state, (len(ids), self.state_dim))
+        self.write_states(ids, states)
+        self.set_goals(ids, goals)
+
+    def set_goals(self, ids: Ids, goals: FloatArray) -> None:
+        """New desired goals and a new clock for some simulations, which stay where they are."""
+        self.goals[ids] = goals
+        self._feasible[ids] = self.feasible(goals)
+        self.elapsed[ids] = 0
+
+    def observe(self, ids: Ids) -> NDArray[np.float32]:
+        """The present observations of some simulations, (n, obs_dim)."""
+        return self.observations(self.read_states(ids), self.goals[ids])
+
+    def step(self, ids: Ids, actions: FloatArray) -> tuple[FloatArray, Step]:
+        """Move some simulations by one step.
+
+        Args:
+            ids: sorted indices of the simulations, (n,).
+            actions: (n, act_dim), clipped to [-1, 1].
+
+        Returns:
+            The states after the step, (n, state_dim), and the outcome.
+        """
+        self.advance(ids, np.clip(actions, -1.0, 1.0))
+        self.elapsed[ids] += 1
+        states = self.read_states(ids)
+        healthy = self.healthy(states)
+        with np.errstate(invalid="ignore"):  # a diverged state is as far as can be
+            distance = np.linalg.norm(self.achieved_goals(states) - self.goals[ids], axis=1)
+            success = healthy & self._feasible[ids] & (distance < self.success_radius)
+        terminated = success | ~healthy
+        truncated = ~terminated & (self.elapsed[ids] >= self.horizon)
+        return states, Step(success.astype(np.float32), terminated, truncated)
+
+
+class MujocoEnv(GoalEnv):
+    """A `GoalEnv` on MuJoCo; the state is qpos and qvel.
+
+    Args:
+        model: the compiled model.
+        num_envs: N.
+        horizon: steps of an episode.
+        threads: simulation threads, 0 for one per core. Results do not depend on it.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, num_envs: int, horizon: int, threads: int = 0
+    ) -> None:
+        super().__init__(num_envs, horizon)
+        self.model = model
+        # A diverged simulation must end its episode, not be put back silently.
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self.batch = Batch(model, num_envs, threads)
+        self._qpos, self._qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        self._ctrl = self.batch.bind("ctrl")
+        self.dt = model.opt.timestep
+
+    def read_states(self, ids: Ids) -> FloatArray:
+        return np.concatenate([self._qpos[ids], self._qvel[ids]], axis=1)
+
+    def write_states(self, ids: Ids, states: FloatArray) -> None:
+        # A reset also clears the solver's warm start, so that a state has one future only.
+        self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+        self._qpos[ids] = states[:, : self.model.nq]
+        self._qvel[ids] = states[:, self.model.nq :]
+
+    def advance(self, ids: Ids, actions: FloatArray) -> None:
+        self._ctrl[ids] = actions
+        self.batch.step(ids)
+
+
+INTEGRATORS = {
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+}
+
+
+def add_walls(spec: mujoco.MjSpec, maze: Maze, height: float, collide: bool) -> None:
+    """Put the maze's walls into a model as boxes from the floor up.
+
+    Args:
+        spec: the model, changed in place.
+        maze: the layout.
+        height: of the walls, metres.
+        collide: whether MuJoCo's contacts stop bodies at the walls.
+    """
+    for i, (x0, y0, x1, y1) in enumerate(maze.walls()):
+        spec.worldbody.add_geom(
+            name=f"wall_{i}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=[(x0 + x1) / 2, (y0 + y1) / 2, height / 2],
+            size=[(x1 - x0) / 2, (y1 - y0) / 2, height / 2],
+            contype=int(collide),
+            conaffinity=int(collide),
+            rgba=[0.55, 0.58, 0.62, 1.0],
+        )

@@ -1,0 +1,90 @@
+"""The point mass in a maze: force-driven and undamped (Florensa et al. 2018).
+
+A sphere of 0.1 m and 0.419 kg under a force of at most 2 N per axis (4.77 m/s^2), 0.02 s a step.
+Walls stop it dead on the axis that hits them and let it slide along the other: an inelastic,
+frictionless contact that holds at any speed.
+"""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from goalgan_bt.envs.batch import INTEGRATORS, Ids, MujocoEnv, add_walls
+from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
+
+RADIUS = 0.1  # m
+
+
+def build_model(maze: Maze, integrator: str = "implicitfast") -> mujoco.MjModel:
+    """gymnasium-robotics' point body with the original's mass, force, step and walls."""
+    # Found, not imported: importing gymnasium-robotics takes a second and prints a notice.
+    package = find_spec("gymnasium_robotics")
+    assert package is not None and package.origin is not None
+    path = Path(package.origin).parent / "envs/assets/point/point.xml"
+    spec = mujoco.MjSpec.from_file(str(path))
+    spec.option.timestep = 0.02
+    spec.option.integrator = INTEGRATORS[integrator]
+    spec.geom("particle_geom").density = 100.0
+    spec.geom("particle_geom").rgba = [0.9, 0.35, 0.15, 1.0]
+    for joint in spec.joints:
+        joint.damping = np.zeros_like(joint.damping)
+    for actuator in spec.actuators:
+        actuator.gear[0] = 2.0  # N per unit of action
+    add_walls(spec, maze, height=0.4, collide=False)  # `Maze.slide` stops the body
+    return spec.compile()
+
+
+class PointMaze(MujocoEnv):
+    """Reach any point of a maze by pushing; success within 0.3 m.
+
+    State: x, y (m), vx, vy (m/s). Observation: the state and the offset to the desired goal, 6
+    numbers. Achieved goal: x, y.
+    """
+
+    success_radius = 0.3
+    act_dim = 2
+    obs_dim = 6
+    start_state = np.zeros(4)
+
+    def __init__(
+        self,
+        maze: Maze,
+        num_envs: int,
+        horizon: int,
+        threads: int = 0,
+        integrator: str = "implicitfast",
+    ) -> None:
+        self.maze = maze
+        self.goal_low, self.goal_high = maze.low, maze.high
+        super().__init__(build_model(maze, integrator), num_envs, horizon, threads)
+        self._maze = maze
+
+    def advance(self, ids: Ids, actions: FloatArray) -> None:
+        before = self._qpos[ids]
+        super().advance(ids, actions)
+        self._qpos[ids], stopped = self._maze.slide(before, self._qpos[ids], RADIUS)
+        self._qvel[ids] = np.where(stopped, 0.0, self._qvel[ids])
+
+    def observations(self, states: FloatArray, goals: FloatArray) -> NDArray[np.float32]:
+        return np.concatenate([states, goals - states[:, :2]], axis=1, dtype=np.float32)
+
+    def achieved_goals(self, states: FloatArray) -> FloatArray:
+        return states[:, :2]
+
+    def place(self, states: FloatArray, goals: FloatArray) -> FloatArray:
+        return np.concatenate([goals, states[:, 2:]], axis=1)
+
+    def healthy(self, states: FloatArray) -> BoolArray:
+        return np.asarray(np.isfinite(states).all(axis=1))
+
+    def valid(self, states: FloatArray) -> BoolArray:
+        return self.healthy(states) & self._maze.is_free(states[:, :2])
+
+    def feasible(self, goals: FloatArray) -> BoolArray:
+        return self._maze.is_free(goals)
+
+    def test_goals(self) -> FloatArray:
+        return self._maze.tiles()

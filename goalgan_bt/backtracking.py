@@ -1,0 +1,254 @@
+"""The backtracking model: what state and action may have led here (Recall Traces, section 2.1).
+
+    q(ds_t, a_t | s_{t+1}) = q(ds_t | a_t, s_{t+1}) q(a_t | s_{t+1}),   ds_t = s_t - s_{t+1}
+
+Two networks, trained by maximum likelihood (equation 2) on the transitions of trajectories that
+reached their goal, and unrolled backward from a state: s_t = s_{t+1} + ds_t. The state here is the
+body's physical state (positions and velocities), without the goal: physics does not know it.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from goalgan_bt.envs.batch import GoalEnv
+from goalgan_bt.envs.maze import BoolArray, FloatArray
+from goalgan_bt.policy import mlp
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class BacktrackingConfig:
+    """The backtracking model and its recall traces (Goyal et al. 2019)."""
+
+    trace_length: int = 20
+    """Steps of a recall trace (paper: 20 point, 50 ant); 0 is plain Goal GAN."""
+    traces: int = 200
+    """Recall traces per iteration, at most."""
+    hidden: tuple[int, ...] = (128, 128)
+    """Units of both networks' hidden layers (paper)."""
+    steps: int = 20
+    """Training steps per policy update (paper: 100 per 5 updates)."""
+    batch: int = 256
+    """Transitions per training step."""
+    learning_rate: float = 1e-3
+    """Step size of Adam."""
+    buffer: int = 100_000
+    """Transitions of successful episodes that are kept, newest first."""
+    min_transitions: int = 5_000
+    """No training and no traces before the buffer holds this many."""
+    max_shift: float = 0.5
+    """The decoder moves an experienced state by at most this much to a goal, metres."""
+    sample_actions: bool = True
+    """Sample a ~ q(a | s'), as in the paper; otherwise its mean."""
+
+
+class Transitions:
+    """A ring of transitions (s, a, s') of successful episodes.
+
+    Attributes:
+        states, next_states: (capacity, state_dim); actions: (capacity, act_dim); the first
+            `size` rows count.
+    """
+
+    def __init__(self, state_dim: int, act_dim: int, cfg: BacktrackingConfig) -> None:
+        capacity, self._minimum = cfg.buffer, cfg.min_transitions
+        self.states = np.zeros((capacity, state_dim), np.float32)
+        self.actions = np.zeros((capacity, act_dim), np.float32)
+        self.next_states = np.zeros((capacity, state_dim), np.float32)
+        self.size, self.cursor = 0, 0
+
+    def add(self, states: Float32, actions: Float32, next_states: Float32) -> None:
+        """Append rows; the oldest make room."""
+        capacity = len(self.states)
+        states, actions, next_states = (x[-capacity:] for x in (states, actions, next_states))
+        rows = (self.cursor + np.arange(len(states))) % capacity
+        self.states[rows], self.actions[rows] = states, actions
+        self.next_states[rows] = next_states
+        self.cursor = int((self.cursor + len(states)) % capacity)
+        self.size = min(self.size + len(states), capacity)
+
+    @property
+    def enough(self) -> bool:
+        """Whether there are transitions enough to learn from."""
+        return self.size >= self._minimum
+
+    def sample_states(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """At most n random states that the agent has had, (<= n, state_dim); none too early."""
+        rows = rng.permutation(self.size)[:n] if self.enough else np.empty(0, dtype=np.int64)
+        return self.next_states[rows].astype(np.float64)
+
+
+class RecallTraces(NamedTuple):
+    """n traces of L steps, the step nearest the goal first.
+
+    states: (L, n, state_dim) s_t; actions: (L, n, act_dim) a_t in [-1, 1], taken in s_t;
+    valid: (L, n) False from the first invalid state on; goals: (n, goal_dim) where each ends;
+    seeds: (n, state_dim) the decoded states from which they were unrolled.
+    """
+
+    states: FloatArray
+    actions: FloatArray
+    valid: BoolArray
+    goals: FloatArray
+    seeds: FloatArray
+
+    def pairs(self, env: GoalEnv) -> tuple[Tensor, Tensor]:
+        """What imitation needs of the valid steps: observations with the goal that seeded the
+        trace, (m, obs_dim), and actions, (m, act_dim)."""
+        goals = np.broadcast_to(self.goals, (*self.valid.shape, env.goal_dim))[self.valid]
+        obs = env.observations(self.states[self.valid], goals)
+        return torch.from_numpy(obs), torch.from_numpy(self.actions[self.valid]).float()
+
+    def paths(self, env: GoalEnv) -> Float32:
+        """Achieved goals along each trace, (L, n, goal_dim), NaN after it stopped."""
+        achieved = env.achieved_goals(self.states.reshape(-1, env.state_dim))
+        paths = achieved.reshape(*self.valid.shape, env.goal_dim)
+        return np.where(self.valid[..., None], paths, np.nan).astype(np.float32)
+
+
+class Scale(nn.Module):
+    """Mean and standard deviation of a quantity, set from data; the same in fit and in traces."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(dim))
+        self.register_buffer("std", torch.ones(dim))
+
+    def set(self, data: Tensor) -> None:
+        """Statistics of data (n, dim), the standard deviation at least 1e-3."""
+        std, self.mean = torch.std_mean(data, dim=0)
+        self.std = std.clamp(min=1e-3)
+
+    def normalise(self, x: Tensor) -> Tensor:
+        """To zero mean and unit variance."""
+        return (x - self.mean) / self.std
+
+    def restore(self, x: Tensor) -> Tensor:
+        """Back to the quantity's own units."""
+        return x * self.std + self.mean
+
+
+class BacktrackingModel(nn.Module):
+    """q(a | s') with unit variance and q(ds | a, s') with a learned one, in normalised units.
+
+    Args:
+        state_dim, act_dim: sizes of the physical state and of the action.
+        cfg: settings.
+        generator: the source of minibatches and samples.
+    """
+
+    def __init__(
+        self, state_dim: int, act_dim: int, cfg: BacktrackingConfig, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.cfg, self._rng = cfg, generator
+        self.action_net = mlp((state_dim, *cfg.hidden, act_dim), nn.Tanh)
+        self.state_net = mlp((state_dim + act_dim, *cfg.hidden, 2 * state_dim), nn.ReLU)
+        self.state_scale, self.delta_scale = Scale(state_dim), Scale(state_dim)
+        self.action_scale = Scale(act_dim)
+        params = [*self.action_net.parameters(), *self.state_net.parameters()]
+        self.optimiser = torch.optim.Adam(params, lr=cfg.learning_rate, fused=True)
+
+    def fit(self, data: Transitions) -> dict[str, float]:
+        """Maximise log q(ds, a | s') (equation 2) for `cfg.steps` steps.
+
+        Returns:
+            action_nll and state_nll, nats per dimension in normalised units (mean over steps);
+            nothing while the buffer is too small.
+        """
+        n, steps = data.size, self.cfg.steps
+        if not data.enough or steps == 0:
+            return {}
+        following = torch.from_numpy(data.next_states[:n])
+        actions = torch.from_numpy(data.actions[:n])
+        deltas = torch.from_numpy(data.states[:n]) - following
+        for scale, x in (
+            (self.state_scale, following),
+            (self.action_scale, actions),
+            (self.delta_scale, deltas),
+        ):
+            scale.set(x)
+        losses = np.zeros((steps, 2))
+        for i in range(steps):
+            rows = torch.randint(n, (self.cfg.batch,), generator=self._rng)
+            action_nll, state_nll = self.negative_log_likelihood(
+                following[rows], actions[rows], deltas[rows]
+            )
+            loss = action_nll + state_nll
+            self.optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            nn.utils.clip_grad_norm_(self.parameters(), 1.0)
+            self.optimiser.step()
+            losses[i] = action_nll.item(), state_nll.item()
+        action_nll, state_nll = losses.mean(axis=0)
+        return {"action_nll": action_nll, "state_nll": state_nll}
+
+    def negative_log_likelihood(
+        self, next_states: Tensor, actions: Tensor, deltas: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """-log q(a | s') and -log q(ds | a, s'), means over the batch and the dimensions.
+
+        Args:
+            next_states: (n, state_dim); actions: (n, act_dim); deltas: (n, state_dim).
+        """
+        s, a = self.state_scale.normalise(next_states), self.action_scale.normalise(actions)
+        constant = 0.5 * np.log(2 * np.pi)
+        action_nll = 0.5 * (a - self.action_net(s)).square().mean() + constant
+        mean, log_var = self._delta(s, a)
+        error = self.delta_scale.normalise(deltas) - mean
+        state_nll = 0.5 * (error.square() * torch.exp(-log_var) + log_var).mean() + constant
+        return action_nll, state_nll
+
+    def _delta(self, s: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+        mean, log_var = self.state_net(torch.cat([s, a], dim=-1)).chunk(2, dim=-1)
+        return mean, log_var.clamp(-10.0, 2.0)
+
+    @torch.no_grad()
+    def predecessors(self, next_states: Tensor) -> tuple[Tensor, Tensor]:
+        """Sample (s_t, a_t) given s_{t+1}: (n, state_dim) -> (n, state_dim), (n, act_dim)."""
+        s = self.state_scale.normalise(next_states)
+        a = self.action_net(s)
+        if self.cfg.sample_actions:
+            a = a + torch.randn(a.shape, generator=self._rng)
+        actions = self.action_scale.restore(a).clamp(-1.0, 1.0)  # the body feels no more
+        mean, log_var = self._delta(s, self.action_scale.normalise(actions))
+        noise = torch.randn(mean.shape, generator=self._rng)
+        delta = self.delta_scale.restore(mean + torch.exp(0.5 * log_var) * noise)
+        return next_states + delta, actions
+
+
+def recall_traces(
+    model: BacktrackingModel, env: GoalEnv, seeds: FloatArray, goals: FloatArray, length: int
+) -> RecallTraces:
+    """Unroll the model backward from states that stand on goals.
+
+    A trace stops at the first state that is not valid (in a wall, fallen, not finite).
+
+    Args:
+        model: the backtracking model.
+        env: knows which states are valid.
+        seeds: (n, state_dim) full states, from the decoder.
+        goals: (n, goal_dim) the goals on which they stand.
+        length: L.
+    """
+    n = len(seeds)
+    states = np.zeros((length, n, env.state_dim))
+    actions = np.zeros((length, n, env.act_dim))
+    valid = np.zeros((length, n), dtype=bool)
+    current, alive = seeds, np.ones(n, dtype=bool)
+    for t in range(length if n else 0):
+        previous, action = model.predecessors(torch.from_numpy(current).float())
+        current = env.repair(previous.double().numpy())
+        alive = alive & env.valid(current)
+        states[t], actions[t], valid[t] = current, action.numpy(), alive
+        current = np.where(alive[:, None], current, seeds)  # a dead trace stays finite
+    return RecallTraces(states, actions, valid, goals, seeds)

@@ -1,0 +1,234 @@
+"""The settings of a run: one dataclass per concept, composed here, a preset per environment."""
+
+import contextlib
+import io
+import json
+import os
+import sys
+import types
+import typing
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from goalgan_bt import envs
+from goalgan_bt.backtracking import BacktrackingConfig
+from goalgan_bt.coverage import CoverageConfig
+from goalgan_bt.gan import GanConfig
+from goalgan_bt.goals import GoalsConfig
+from goalgan_bt.imitation import ImitationConfig
+from goalgan_bt.policy import PolicyConfig, ValueConfig
+from goalgan_bt.rollout import RolloutConfig
+from goalgan_bt.trpo import TrpoConfig
+
+
+class ConfigError(ValueError):
+    """Settings that cannot be run; the message says which and what to do."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Learn to reach every free point of a maze: Goal GAN, recall traces, TRPO."""
+
+    env: str = "ant_umaze"
+    """Environment: {point,ant}_{umaze,spiral,medium,large} or point_nd. Picks the preset."""
+    seed: int = 0
+    """Seed of everything random."""
+    iterations: int | None = None
+    """Stop after this many iterations."""
+    total_steps: int | None = None
+    """Stop after this many environment steps of training."""
+    minutes: float | None = None
+    """Stop after this much wall time, minutes."""
+    out: Path = Path("runs")
+    """Folder of runs; this run gets a folder of its own in it."""
+    resume: Path | None = None
+    """Go on with this run (its folder); its settings are the defaults."""
+    map: Path | None = None
+    """Text map that replaces the maze: '#' wall, '.' free, 'S' start."""
+    dim: int = 2
+    """Dimensions of point_nd, 2 to 6."""
+    horizon: int | None = None
+    """Steps of an episode; by default 200 (point) or 500 (ant), more in longer mazes."""
+    integrator: Literal["implicitfast", "rk4"] = "implicitfast"
+    """MuJoCo's integrator; rk4 is the original's and costs four times as much."""
+    threads: int = 0
+    """Threads for simulation and for learning; 0 is one per core."""
+    discount: float = 0.995
+    """Discount factor per step (the original: 0.99)."""
+    gae_lambda: float = 0.95
+    """Lambda of generalised advantage estimation (the original: 1)."""
+    updates: int = 1
+    """Policy updates per iteration (the original: 5)."""
+    report_every: int = 5
+    """Iterations between two reports (a line on the terminal, a frame in the run folder)."""
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    value: ValueConfig = field(default_factory=ValueConfig)
+    rollout: RolloutConfig = field(default_factory=RolloutConfig)
+    goals: GoalsConfig = field(default_factory=GoalsConfig)
+    gan: GanConfig = field(default_factory=GanConfig)
+    trpo: TrpoConfig = field(default_factory=TrpoConfig)
+    backtracking: BacktrackingConfig = field(default_factory=BacktrackingConfig)
+    imitation: ImitationConfig = field(default_factory=ImitationConfig)
+    coverage: CoverageConfig = field(default_factory=CoverageConfig)
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Environment steps of training in one iteration."""
+        return self.updates * self.rollout.num_envs * self.rollout.steps
+
+    @property
+    def num_threads(self) -> int:
+        """Threads, with 0 resolved to the cores this process may use."""
+        return self.threads or len(os.sched_getaffinity(0))
+
+
+ANT = Config(
+    env="ant_umaze",
+    total_steps=12_000_000,
+    backtracking=BacktrackingConfig(trace_length=50),
+)
+POINT = Config(
+    env="point_umaze",
+    total_steps=4_000_000,
+    discount=0.99,
+    policy=PolicyConfig(init_std=1.0),
+    rollout=RolloutConfig(num_envs=256, steps=80),
+    trpo=TrpoConfig(max_kl=0.02),
+    coverage=CoverageConfig(rollouts=2, every=250_000),
+    backtracking=BacktrackingConfig(trace_length=20),
+)
+
+
+def preset(env: str) -> Config:
+    """The default settings for an environment.
+
+    Raises:
+        ConfigError: if there is no such environment.
+    """
+    if env not in envs.NAMES:
+        raise ConfigError(f"unknown environment {env!r}: choose one of {', '.join(envs.NAMES)}")
+    return replace(ANT if env.startswith("ant") else POINT, env=env)
+
+
+def check(cfg: Config) -> None:
+    """Refuse settings that make no sense.
+
+    Raises:
+        ConfigError: naming the first such setting.
+    """
+    above_zero = (
+        "iterations total_steps minutes horizon updates report_every rollout.num_envs "
+        "rollout.steps goals.new policy.init_std policy.min_std value.learning_rate value.epochs "
+        "value.minibatch gan.learning_rate gan.batch gan.steps gan.noise_dim trpo.max_kl "
+        "trpo.cg_iters trpo.fisher_fraction backtracking.batch backtracking.buffer "
+        "backtracking.learning_rate imitation.batch imitation.learning_rate imitation.max_kl "
+        "coverage.rollouts coverage.every"
+    )
+    not_negative = (
+        "seed threads goals.old goals.replay_distance goals.label_rollouts gan.goal_noise "
+        "gan.pretrain_steps backtracking.trace_length backtracking.steps backtracking.traces "
+        "imitation.steps trpo.cg_damping trpo.line_search_steps"
+    )
+    shares = "discount gae_lambda rollout.chain goals.r_min goals.r_max trpo.fisher_fraction"
+    for names, good, what in (
+        (above_zero, lambda x: x > 0, "greater than 0"),
+        (not_negative, lambda x: x >= 0, "0 or more"),
+        (shares, lambda x: 0 <= x <= 1, "between 0 and 1"),
+    ):
+        for name in names.split():
+            value: Any = cfg
+            for part in name.split("."):
+                value = getattr(value, part)
+            if value is not None and not good(value):
+                flag = name.replace("_", "-")
+                raise ConfigError(f"--{flag} must be {what}, not {value}")
+    if cfg.goals.r_min >= cfg.goals.r_max:
+        raise ConfigError("--goals.r-min must be less than --goals.r-max")
+
+
+def from_command_line(argv: list[str] | None = None) -> Config:
+    """The settings that the command line asks for: the preset of `--env`, then every other flag.
+
+    With `--resume RUN` the run's own settings take the preset's place.
+
+    Raises:
+        ConfigError: for an unknown flag, a bad value or a folder that is no run.
+        SystemExit: after `--help`.
+    """
+    argv = sys.argv[1:] if argv is None else argv
+    default = ANT
+    if (run := _value_of(argv, "--resume")) is not None:
+        default = replace(load(Path(run)), iterations=None, total_steps=None, minutes=None)
+        if (env := _value_of(argv, "--env")) not in (None, default.env):
+            raise ConfigError(f"{run} is a run of {default.env}, not {env}: drop --env")
+    elif (env := _value_of(argv, "--env")) is not None:
+        default = preset(env)
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+            cfg = tyro.cli(Config, default=default, args=argv, prog="python -m goalgan_bt.train")
+    except SystemExit as stop:
+        if not stop.code:  # --help
+            sys.stdout.write(printed.getvalue())
+            raise
+        raise ConfigError(_one_line(printed.getvalue())) from None
+    check(cfg)
+    return cfg
+
+
+def save(cfg: Config, folder: Path) -> None:
+    """Write the settings to `config.json` in a run folder."""
+    (folder / "config.json").write_text(json.dumps(asdict(cfg), indent=2, default=str) + "\n")
+
+
+def load(folder: Path) -> Config:
+    """The settings of a run folder.
+
+    Raises:
+        ConfigError: if the folder is no run or its settings cannot be read.
+    """
+    try:
+        return _build(Config, json.loads((folder / "config.json").read_text()))
+    except FileNotFoundError:
+        raise ConfigError(f"{folder} is no run: it has no config.json") from None
+    except (OSError, ValueError, TypeError) as error:
+        raise ConfigError(f"cannot read {folder / 'config.json'}: {error}") from None
+
+
+def _build(kind: type[Any], values: dict[str, Any]) -> Any:
+    """A dataclass from what `asdict` and JSON made of it."""
+    hints = typing.get_type_hints(kind)
+    known = {f.name for f in fields(kind)}
+    if unknown := set(values) - known:
+        raise ValueError(f"unknown settings {', '.join(sorted(unknown))}")
+    return kind(**{name: _convert(hints[name], value) for name, value in values.items()})
+
+
+def _convert(hint: Any, value: Any) -> Any:
+    if is_dataclass(hint):
+        return _build(typing.cast(type[Any], hint), value)
+    if value is not None and (
+        hint is Path or (isinstance(hint, types.UnionType) and Path in typing.get_args(hint))
+    ):
+        return Path(value)
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _value_of(argv: list[str], flag: str) -> str | None:
+    """The value given to a flag, as `--flag value` or `--flag=value`; the last one counts."""
+    value = None
+    for word, following in zip(argv, [*argv[1:], None], strict=True):
+        if word == flag:
+            value = following
+        elif word.startswith(flag + "="):
+            value = word.split("=", 1)[1]
+    return value
+
+
+def _one_line(text: str) -> str:
+    """What tyro prints in a box, without the box."""
+    words = "".join(" " if c in "╭╮╰╯│─━┃\n" else c for c in text).split()
+    return " ".join(words)

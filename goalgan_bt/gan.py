@@ -1,0 +1,126 @@
+"""The Goal GAN: a least-squares GAN that proposes goals of intermediate difficulty.
+
+Florensa et al. 2018, section 4.2: with a label y_g in {0, 1} for each goal (1: of intermediate
+difficulty),
+    D: min E_data[y (D(g) - b)^2 + (1 - y) (D(g) - a)^2] + E_z[(D(G(z)) - a)^2]
+    G: min E_z[(D(G(z)) - c)^2]
+with a = -1, b = 1 and c = 0 in the paper, c = b = 1 in the authors' code. Goals are normalised to
+[-1, 1] over the goal box (the original's extra factor of 2 let samples land outside of it).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from goalgan_bt.envs.maze import BoolArray, FloatArray
+from goalgan_bt.policy import mlp
+
+
+@dataclass(frozen=True)
+class GanConfig:
+    """The goal GAN (Florensa et al. 2018)."""
+
+    noise_dim: int = 4
+    """Size of z."""
+    generator_hidden: tuple[int, ...] = (256, 256)
+    """Units of the generator's hidden layers (relu)."""
+    discriminator_hidden: tuple[int, ...] = (128, 128)
+    """Units of the discriminator's hidden layers (leaky relu 0.1)."""
+    learning_rate: float = 1e-3
+    """Step size of RMSProp (decay 0.9), both networks."""
+    batch: int = 64
+    """Real goals, and as many generated ones, per step."""
+    steps: int = 100
+    """Training steps per iteration (the original: 250 to 300)."""
+    pretrain_steps: int = 300
+    """Training steps on what the fresh policy visits."""
+    generator_target: float = 1.0
+    """c, what the generator wants D to say: 1 in the original code, 0 in the paper."""
+    goal_noise: float = 0.5
+    """Standard deviation of the noise added to generated goals, metres."""
+
+
+class GoalGAN:
+    """Generator and discriminator of goals in a box.
+
+    Args:
+        low, high: (goal_dim,) the goal box, metres.
+        cfg: settings.
+        generator: the source of z and of minibatches.
+    """
+
+    def __init__(
+        self, low: FloatArray, high: FloatArray, cfg: GanConfig, generator: torch.Generator
+    ) -> None:
+        self.low, self.high, self.cfg, self._rng = low, high, cfg, generator
+        dim = len(low)
+        self.generator = mlp((cfg.noise_dim, *cfg.generator_hidden, dim), nn.ReLU)
+        self.discriminator = mlp((dim, *cfg.discriminator_hidden, 1), LeakyReLU)
+        # TensorFlow's RMSProp, as the original used it; torch's defaults differ.
+        self.generator_optimiser, self.discriminator_optimiser = (
+            torch.optim.RMSprop(net.parameters(), lr=cfg.learning_rate, alpha=0.9, eps=1e-10)
+            for net in (self.generator, self.discriminator)
+        )
+
+    @torch.no_grad()
+    def sample(self, n: int) -> FloatArray:
+        """Goals from the generator plus noise, clipped to the box, (n, goal_dim) metres."""
+        x = torch.tanh(self.generator(self._noise(n))).double()
+        goals = (self.low + self.high) / 2 + (self.high - self.low) / 2 * x.numpy()
+        noise = torch.randn(goals.shape, generator=self._rng, dtype=torch.float64).numpy()
+        return np.clip(goals + self.cfg.goal_noise * noise, self.low, self.high)
+
+    def fit(
+        self, goals: FloatArray, labels: BoolArray, steps: int | None = None
+    ) -> dict[str, float]:
+        """Train both networks; not at all on labels that are all negative (nothing to imitate).
+
+        Args:
+            goals: (n, goal_dim) metres.
+            labels: (n,) whether each is of intermediate difficulty.
+            steps: training steps, `cfg.steps` if None.
+
+        Returns:
+            Mean losses of the last quarter: discriminator_loss, generator_loss (NaN if skipped).
+        """
+        if not labels.any():
+            return {"discriminator_loss": np.nan, "generator_loss": np.nan}
+        steps = self.cfg.steps if steps is None else steps
+        x = torch.from_numpy(self._normalise(goals)).float()
+        target = torch.from_numpy(2.0 * labels - 1.0).float()[:, None]
+        losses = np.zeros((steps, 2))
+        for i in range(steps):
+            rows = torch.randint(len(x), (min(self.cfg.batch, len(x)),), generator=self._rng)
+            fake = torch.tanh(self.generator(self._noise(self.cfg.batch)))
+
+            real_loss = (self.discriminator(x[rows]) - target[rows]).square()
+            fake_loss = (self.discriminator(fake.detach()) + 1.0).square()
+            loss_d = torch.cat([real_loss, fake_loss]).mean()
+            _descend(self.discriminator_optimiser, loss_d)
+
+            loss_g = (self.discriminator(fake) - self.cfg.generator_target).square().mean()
+            _descend(self.generator_optimiser, loss_g)
+            losses[i] = loss_d.item(), loss_g.item()
+        discriminator, generator = losses[-max(1, steps // 4) :].mean(axis=0)
+        return {"discriminator_loss": discriminator, "generator_loss": generator}
+
+    def _normalise(self, goals: FloatArray) -> FloatArray:
+        return 2 * (goals - self.low) / (self.high - self.low) - 1
+
+    def _noise(self, n: int) -> Tensor:
+        return torch.randn(n, self.cfg.noise_dim, generator=self._rng)
+
+
+class LeakyReLU(nn.LeakyReLU):
+    """The discriminator's activation: slope 0.1 below zero."""
+
+    def __init__(self) -> None:
+        super().__init__(0.1)
+
+
+def _descend(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
+    optimiser.zero_grad(set_to_none=True)
+    loss.backward()
+    optimiser.step()

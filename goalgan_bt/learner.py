@@ -1,0 +1,109 @@
+"""All that learns or remembers, in one place: what a checkpoint holds is what is listed here."""
+
+import ast
+from typing import Any
+
+import numpy as np
+import torch
+
+from goalgan_bt.backtracking import BacktrackingModel, Transitions
+from goalgan_bt.config import Config
+from goalgan_bt.envs.batch import GoalEnv
+from goalgan_bt.gan import GoalGAN
+from goalgan_bt.goals import GoalReplay, SuccessEstimator
+from goalgan_bt.imitation import Imitation
+from goalgan_bt.policy import GaussianPolicy, ValueFunction
+
+
+class Learner:
+    """The training state, random generators included.
+
+    Attributes:
+        iteration: finished iterations; steps: environment steps by purpose (`train`, `label`,
+            `eval`); seconds: wall time so far.
+        rng: numpy's generator; noise: torch's.
+        policy, value, gan, estimator, replay, backtracking, transitions, imitation: the parts.
+    """
+
+    def __init__(self, env: GoalEnv, cfg: Config) -> None:
+        torch.manual_seed(cfg.seed)  # first weights
+        self.iteration = 0
+        self.steps = {"train": 0, "label": 0, "eval": 0}
+        self.seconds = 0.0
+        self.next_coverage = 0
+        self.rng = np.random.default_rng(cfg.seed)
+        self.noise = torch.Generator().manual_seed(cfg.seed)
+        box = env.goal_low, env.goal_high
+        self.policy = GaussianPolicy(env.obs_dim, env.act_dim, cfg.policy)
+        self.value = ValueFunction(env.obs_dim, cfg.value)
+        self.gan = GoalGAN(*box, cfg.gan, self.noise)
+        self.estimator = SuccessEstimator(*box, cfg.goals, self.noise)
+        self.replay = GoalReplay(env.goal_dim, cfg.goals.replay_distance)
+        self.backtracking = BacktrackingModel(
+            env.state_dim, env.act_dim, cfg.backtracking, self.noise
+        )
+        self.transitions = Transitions(env.state_dim, env.act_dim, cfg.backtracking)
+        self.imitation = Imitation(self.policy, cfg.imitation, self.noise)
+
+    def _modules(self) -> dict[str, Any]:
+        """Everything with torch's `state_dict` and `load_state_dict`: networks, optimisers."""
+        return {
+            "policy": self.policy,
+            "value": self.value,
+            "value_optimiser": self.value.optimiser,
+            "generator": self.gan.generator,
+            "generator_optimiser": self.gan.generator_optimiser,
+            "discriminator": self.gan.discriminator,
+            "discriminator_optimiser": self.gan.discriminator_optimiser,
+            "estimator": self.estimator.net,
+            "estimator_optimiser": self.estimator.optimiser,
+            "backtracking": self.backtracking,
+            "backtracking_optimiser": self.backtracking.optimiser,
+            "imitation_optimiser": self.imitation.optimiser,
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors and plain values only, so that it loads with `weights_only=True`."""
+        rows = self.transitions
+        return {
+            "modules": {name: module.state_dict() for name, module in self._modules().items()},
+            "iteration": self.iteration,
+            "steps": dict(self.steps),
+            "seconds": self.seconds,
+            "next_coverage": self.next_coverage,
+            "rng": repr(self.rng.bit_generator.state),  # integers too long for a tensor
+            "noise": self.noise.get_state(),
+            "replay": torch.from_numpy(self.replay.goals),
+            "estimator_goals": torch.from_numpy(self.estimator.goals),
+            "estimator_success": torch.from_numpy(self.estimator.success),
+            "transitions": {
+                "states": torch.from_numpy(rows.states[: rows.size]).clone(),
+                "actions": torch.from_numpy(rows.actions[: rows.size]).clone(),
+                "next_states": torch.from_numpy(rows.next_states[: rows.size]).clone(),
+                "cursor": rows.cursor,
+            },
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` gave.
+
+        Raises:
+            KeyError, RuntimeError, ValueError, TypeError: if it is not such a state or of other
+                sizes.
+        """
+        for name, module in self._modules().items():
+            module.load_state_dict(state["modules"][name])
+        self.iteration = int(state["iteration"])
+        self.steps = {name: int(state["steps"][name]) for name in self.steps}
+        self.seconds = float(state["seconds"])
+        self.next_coverage = int(state["next_coverage"])
+        self.rng.bit_generator.state = ast.literal_eval(state["rng"])
+        self.noise.set_state(state["noise"])
+        self.replay.goals = state["replay"].numpy().copy()
+        self.estimator.goals = state["estimator_goals"].numpy().copy()
+        self.estimator.success = state["estimator_success"].numpy().copy()
+        saved, rows = state["transitions"], self.transitions
+        size = len(saved["states"])
+        for name in ("states", "actions", "next_states"):
+            getattr(rows, name)[:size] = saved[name].numpy()
+        rows.size, rows.cursor = size, int(saved["cursor"])

@@ -1,0 +1,199 @@
+"""The run folder: everything a viewer, a plot or a colleague needs, and nothing to unpickle.
+
+runs/<env>-<time>-s<seed>/
+    config.json       the resolved settings
+    meta.json         versions, git commit, command line, the maze as text
+    metrics.csv       a row per iteration; columns may be added while it grows
+    frames/000010.npz a report: goals, labels, replay, traces, coverage (see `Record.frame`)
+    checkpoint.pt     the whole training state (see `goalgan_bt.checkpoint`)
+    events.*          TensorBoard, if it is installed (extra `tensorboard`)
+"""
+
+import csv
+import io
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from goalgan_bt.envs.maze import Maze
+
+PACKAGES = ("goalgan_bt", "mujoco", "numpy", "torch", "gymnasium", "gymnasium-robotics", "tyro")
+
+
+class RunError(ValueError):
+    """A folder that is not the run it should be; the message says what to do."""
+
+
+def create_folder(out: Path, env: str, seed: int) -> Path:
+    """A new, empty run folder `<env>-<time>-s<seed>` in `out`."""
+    name = f"{env}-{time.strftime('%Y%m%d-%H%M%S')}-s{seed}"
+    for attempt in range(1, 1000):
+        folder = out / (name if attempt == 1 else f"{name}-{attempt}")
+        try:
+            (folder / "frames").mkdir(parents=True)
+            return folder
+        except FileExistsError:
+            if not folder.exists():  # `out` itself, or a part of it, is a file
+                break
+    raise RunError(f"cannot make a run folder in {out}: choose another with --out")
+
+
+def write_meta(folder: Path, maze: Maze | None) -> None:
+    """Write what is needed to know and to draw this run to `meta.json`."""
+    commit = subprocess.run(
+        ["git", "describe", "--always", "--dirty", "--abbrev=40"],
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    versions = {}
+    for package in PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            versions[package] = "not installed"
+    meta = {
+        "argv": sys.argv[1:],
+        "commit": commit.stdout.strip() or None,
+        "python": platform.python_version(),
+        "cores": len(os.sched_getaffinity(0)),
+        "versions": versions,
+        "maze": None if maze is None else {"rows": maze.rows, "cell_size": maze.cell_size},
+    }
+    (folder / "meta.json").write_text(json.dumps(meta, indent=2) + "\n")
+
+
+class Record:
+    """Writes metrics and frames into a run folder.
+
+    Args:
+        folder: the run folder.
+        iteration: rows after this one are dropped, for a run that is taken up again.
+    """
+
+    def __init__(self, folder: Path, iteration: int = 0) -> None:
+        self.folder = folder
+        self._rows: list[dict[str, str]] = []
+        self._columns: list[str] = []
+        (folder / "frames").mkdir(exist_ok=True)
+        if (folder / "metrics.csv").exists():
+            self._columns, rows = read_metrics(folder)
+            self._rows = [row for row in rows if int(row["iteration"]) <= iteration]
+            self._rewrite()
+        for frame in frames(folder):
+            if int(frame.stem) > iteration:
+                frame.unlink()
+        self._events = _tensorboard(folder)
+
+    def metrics(self, row: dict[str, float]) -> None:
+        """Append a row; a value that is missing or NaN is an empty cell."""
+        cells = {k: f"{v:.6g}" if isinstance(v, float) else str(v) for k, v in row.items()}
+        cells = {k: "" if v == "nan" else v for k, v in cells.items()}
+        self._rows.append(cells)
+        new = [name for name in cells if name not in self._columns]
+        if new:
+            self._columns += new
+            self._rewrite()
+        else:
+            with (self.folder / "metrics.csv").open("a", newline="") as file:
+                csv.DictWriter(file, self._columns, restval="").writerow(cells)
+        if self._events is not None:
+            for name, value in row.items():
+                if cells[name] and name != "iteration":
+                    self._events.add_scalar(name, value, int(row["steps/train"]))
+
+    def frame(self, iteration: int, **arrays: Any) -> None:
+        """Write one report's arrays to `frames/<iteration>.npz`.
+
+        Args:
+            iteration: names the file.
+            arrays: goals (n, goal_dim), success (n,) estimated, label (n,) -1 too hard,
+                0 intermediate, 1 too easy, replayed (n,) bool; replay (m, goal_dim);
+                traces (L, k, goal_dim) with NaN after a trace stopped, trace_goals (k, goal_dim);
+                test_goals (K, goal_dim), estimate (K,) of their success, and coverage (K,)
+                measured, NaN where this report has none.
+        """
+        path = self.folder / "frames" / f"{iteration:06d}.npz"
+        write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
+
+    def close(self) -> None:
+        """Flush what TensorBoard buffers."""
+        if self._events is not None:
+            self._events.close()
+
+    def _rewrite(self) -> None:
+        def write(file: Any) -> None:
+            text = io.TextIOWrapper(file, newline="")
+            writer = csv.DictWriter(text, self._columns, restval="")
+            writer.writeheader()
+            writer.writerows(self._rows)
+            text.flush()
+            text.detach()
+
+        write_atomically(self.folder / "metrics.csv", write)
+
+
+def write_atomically(path: Path, write: Any) -> None:
+    """Call `write(binary file)` on a temporary file that then takes `path`'s place."""
+    temporary = path.with_name(path.name + ".part")
+    try:
+        with temporary.open("wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def read_metrics(folder: Path) -> tuple[list[str], list[dict[str, str]]]:
+    """Columns and rows of a run's `metrics.csv`, as text; a last row cut short is left out.
+
+    Raises:
+        RunError: if the folder has none.
+    """
+    try:
+        with (folder / "metrics.csv").open(newline="") as file:
+            reader = csv.DictReader(file)
+            rows = [row for row in reader if None not in row.values()]
+            return list(reader.fieldnames or []), rows
+    except OSError:
+        raise RunError(f"{folder} is no run: it has no metrics.csv") from None
+
+
+def read_meta(folder: Path) -> dict[str, Any]:
+    """A run's `meta.json`.
+
+    Raises:
+        RunError: if the folder has none or it cannot be read.
+    """
+    try:
+        meta: dict[str, Any] = json.loads((folder / "meta.json").read_text())
+    except FileNotFoundError:
+        raise RunError(f"{folder} is no run: it has no meta.json") from None
+    except (OSError, ValueError) as error:
+        raise RunError(f"cannot read {folder / 'meta.json'}: {error}") from None
+    return meta
+
+
+def frames(folder: Path) -> list[Path]:
+    """The frames of a run, oldest first."""
+    return sorted((folder / "frames").glob("[0-9]*.npz"))
+
+
+def _tensorboard(folder: Path) -> Any:
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        return None
+    return SummaryWriter(str(folder))

@@ -1,0 +1,365 @@
+"""The training loop: from goals to picture, one iteration at a time.
+
+    python -m goalgan_bt.train --env ant_umaze
+
+Florensa et al. 2018, Algorithm 1 (goals, policy update, labels, GAN) with Goyal et al. 2019,
+Algorithm 1 inside of it (backtracking model, recall traces, imitation).
+"""
+
+import errno
+import signal
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from goalgan_bt import checkpoint, config, envs, record, trpo
+from goalgan_bt.advantage import gae
+from goalgan_bt.backtracking import recall_traces
+from goalgan_bt.config import Config
+from goalgan_bt.coverage import success_rate
+from goalgan_bt.decoder import decode
+from goalgan_bt.envs.batch import GoalEnv
+from goalgan_bt.envs.maze import MapError
+from goalgan_bt.goals import intermediate
+from goalgan_bt.learner import Learner
+from goalgan_bt.progress import Progress, complain, say
+from goalgan_bt.record import Record
+from goalgan_bt.rollout import Collector, Rollouts
+
+TEST_ENVS = 512  # simulations side by side when coverage is measured
+FRAME_TRACES = 64  # traces kept in a frame
+SEED_STATES = 4000  # experienced states among which the decoder looks
+KL_SAMPLE = 2048  # observations on which imitation's KL is bounded
+
+
+class Trained(NamedTuple):
+    """coverage: the last measured, stochastic policy; steps: environment steps of training."""
+
+    coverage: float
+    steps: int
+
+
+def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
+    """Learn to reach every free point of the maze.
+
+    Args:
+        cfg: settings; with `resume`, the learner goes on from the folder's checkpoint.
+        folder: the run folder (see `goalgan_bt.record`).
+        stop: asked after every iteration whether to end early.
+    """
+    torch.set_num_threads(cfg.num_threads)
+    env, test_env = make_env(cfg, cfg.rollout.num_envs), make_env(cfg, TEST_ENVS)
+    learner = Learner(env, cfg)
+    if cfg.resume is not None:
+        checkpoint.load(learner, folder)
+    policy, rng, noise = learner.policy, learner.rng, learner.noise
+    collector = Collector(env, cfg.rollout, rng, noise)
+    test_goals = env.test_goals()
+    records = Record(folder, learner.iteration)
+    clock = Clock(learner.seconds)
+    coverage = float("nan")
+
+    # Before any curriculum exists, goals are wherever a fresh policy happens to wander.
+    if learner.iteration == 0:
+        anywhere = rng.uniform(env.goal_low, env.goal_high, (1000, env.goal_dim))
+        collector.begin(anywhere)
+        rollouts, _ = collector.collect(policy, anywhere)
+        learner.steps["train"] += rollouts.rewards.size
+        policy.normaliser.update(flat(rollouts.obs))
+        visited = env.achieved_goals(env.read_states(np.arange(env.num_envs)))
+        learner.gan.fit(visited, np.ones(len(visited), dtype=bool), cfg.gan.pretrain_steps)
+    collector.begin(learner.gan.sample(cfg.goals.new))
+
+    with Progress(f"{env.name}, seed {cfg.seed}") as progress:
+        last = False
+        while not last:
+            learner.iteration += 1
+            metrics: dict[str, float] = {"iteration": learner.iteration}
+
+            # Goals: most imagined by the generator, some remembered so that old skills stay.
+            imagined = learner.gan.sample(cfg.goals.new)
+            goals = np.concatenate([imagined, learner.replay.sample(cfg.goals.old, rng)])
+
+            for _ in range(cfg.updates):
+                # Rollouts: every simulation goes on where it was.
+                with clock.measure("simulation"):
+                    rollouts, episodes = collector.collect(policy, goals)
+                learner.steps["train"] += rollouts.rewards.size
+
+                with clock.measure("learning"):
+                    # Policy: a trust-region step on what happened.
+                    obs = policy.normaliser(flat(rollouts.obs))
+                    metrics |= update_policy(learner, rollouts, obs, cfg)
+
+                    # What the episodes tell: how hard each goal is, what preceded success.
+                    first = episodes.from_start
+                    learner.estimator.add(episodes.goals[first], episodes.success[first])
+                    metrics |= group("estimator", learner.estimator.fit())
+                    learner.transitions.add(episodes.states, episodes.actions, episodes.next_states)
+                    if cfg.backtracking.trace_length:
+                        losses = learner.backtracking.fit(learner.transitions)
+                        metrics |= group("backtracking", losses)
+
+            # Labels: goals neither hopeless nor mastered teach the generator what to propose next.
+            if cfg.goals.label_rollouts:
+                with clock.measure("label"):
+                    success, steps = success_rate(
+                        test_env, policy, goals, cfg.goals.label_rollouts, noise
+                    )
+                learner.steps["label"] += steps
+            else:
+                success = learner.estimator(goals)
+            with clock.measure("learning"):
+                labels = intermediate(success, cfg.goals.r_min, cfg.goals.r_max)
+                metrics |= group("gan", learner.gan.fit(goals, labels))
+                learner.replay.add(goals[labels])
+
+                # Recall traces: imagine more ways of getting to those goals, and imitate them.
+                seeds = decode(
+                    env,
+                    goals[labels][: cfg.backtracking.traces],
+                    learner.transitions.sample_states(SEED_STATES, rng),
+                    cfg.backtracking.max_shift,
+                    rng,
+                )
+                traces = recall_traces(
+                    learner.backtracking, env, *seeds, cfg.backtracking.trace_length
+                )
+                trace_obs, trace_actions = traces.pairs(env)
+                reference = obs[:: max(1, len(obs) // KL_SAMPLE)]
+                metrics |= group(
+                    "imitation",
+                    learner.imitation.update(
+                        policy.normaliser(trace_obs), trace_actions, reference
+                    ),
+                )
+                # Only now: the policy must not change under data that it made.
+                policy.normaliser.update(flat(rollouts.obs))
+
+            # Coverage, once in a while; then everything that a viewer reads.
+            last = finished(cfg, learner, clock.total()) >= 1 or (
+                stop is not None and stop.requested
+            )
+            measured = np.full(len(test_goals), np.nan)
+            measure = learner.steps["train"] >= learner.next_coverage or last
+            if measure:
+                with clock.measure("evaluation"):
+                    measured, steps = success_rate(
+                        test_env, policy, test_goals, cfg.coverage.rollouts, noise
+                    )
+                    by_mean, mean_steps = success_rate(test_env, policy, test_goals, 1, None)
+                learner.steps["eval"] += steps + mean_steps
+                learner.next_coverage = learner.steps["train"] + cfg.coverage.every
+                coverage = metrics["eval/coverage"] = float(measured.mean())
+                metrics["eval/coverage_deterministic"] = float(by_mean.mean())
+
+            estimate = learner.estimator(test_goals)
+            metrics |= group("steps", learner.steps)
+            metrics |= group("time", clock.metrics(learner.steps["train"]))
+            metrics |= {
+                "rollout/success": float(episodes.success.mean())
+                if len(episodes.success)
+                else np.nan,
+                "rollout/std": float(policy.log_std.detach().exp().mean()),
+                "curriculum/intermediate": float(labels.mean()),
+                "curriculum/too_hard": float((success <= cfg.goals.r_min).mean()),
+                "curriculum/too_easy": float((success >= cfg.goals.r_max).mean()),
+                "curriculum/replay": len(learner.replay),
+                "curriculum/estimated_coverage": float(estimate.mean()),
+                "backtracking/traces": traces.valid.shape[1],
+                "backtracking/valid": float(traces.valid.mean()) if traces.valid.size else np.nan,
+            }
+            records.metrics(metrics)
+            if measure or learner.iteration % cfg.report_every == 0:
+                done = finished(cfg, learner, clock.total())
+                progress.report(metrics, clock.total() * (1 / done - 1) if done else np.inf)
+                records.frame(
+                    learner.iteration,
+                    goals=goals,
+                    success=success,
+                    label=np.where(labels, 0, np.where(success <= cfg.goals.r_min, -1, 1)),
+                    replayed=np.arange(len(goals)) >= len(imagined),
+                    replay=learner.replay.goals,
+                    traces=traces.paths(env)[:, :FRAME_TRACES],
+                    trace_goals=traces.goals[:FRAME_TRACES],
+                    test_goals=test_goals,
+                    estimate=estimate,
+                    coverage=measured,
+                )
+            if measure:
+                learner.seconds = clock.total()
+                checkpoint.save(learner, folder)
+    records.close()
+    return Trained(coverage, learner.steps["train"])
+
+
+def update_policy(
+    learner: Learner, rollouts: Rollouts, obs: Tensor, cfg: Config
+) -> dict[str, float]:
+    """One TRPO step and a fit of the value function on a batch.
+
+    Args:
+        learner: whose policy and value function learn.
+        rollouts: the batch, (T, N, ...).
+        obs: (T * N, obs_dim) its normalised observations.
+        cfg: settings.
+    """
+    policy, value = learner.policy, learner.value
+
+    @torch.no_grad()
+    def values_of(raw: np.ndarray) -> np.ndarray:
+        return value(policy.normaliser(torch.from_numpy(raw))).numpy()
+
+    with torch.no_grad():
+        values = value(obs).view(rollouts.rewards.shape).numpy()
+    advantages, returns = gae(
+        rollouts.rewards,
+        values,
+        rollouts.next_values(values, values_of),
+        rollouts.terminated,
+        rollouts.truncated,
+        cfg.discount,
+        cfg.gae_lambda,
+    )
+    step = trpo.update(
+        policy, obs, flat(rollouts.actions), flat(advantages), cfg.trpo, learner.noise
+    )
+    return group("trpo", step) | group("value", value.fit(obs, flat(returns), learner.noise))
+
+
+def flat(array: np.ndarray) -> Tensor:
+    """(T, N, ...) as a tensor (T * N, ...) that shares its memory."""
+    return torch.from_numpy(array).flatten(0, 1)
+
+
+def group(name: str, values: Mapping[str, float]) -> dict[str, float]:
+    """Metrics under a common name: `name/key`."""
+    return {f"{name}/{key}": value for key, value in values.items()}
+
+
+def finished(cfg: Config, learner: Learner, seconds: float) -> float:
+    """How far a run is towards the first of its limits: 1 or more at its end, 0 without limits."""
+    return max(
+        learner.iteration / cfg.iterations if cfg.iterations else 0.0,
+        learner.steps["train"] / cfg.total_steps if cfg.total_steps else 0.0,
+        seconds / (60 * cfg.minutes) if cfg.minutes else 0.0,
+    )
+
+
+def make_env(cfg: Config, num_envs: int) -> GoalEnv:
+    """The environment that the settings name."""
+    return envs.make(
+        cfg.env,
+        num_envs,
+        threads=cfg.num_threads,
+        horizon=cfg.horizon,
+        integrator=cfg.integrator,
+        dim=cfg.dim,
+        map_file=cfg.map,
+    )
+
+
+class Clock:
+    """Wall time, in all and by activity.
+
+    Args:
+        before: seconds of the run before it was resumed.
+    """
+
+    def __init__(self, before: float) -> None:
+        self._before, self._begin = before, time.perf_counter()
+        self._spent = dict.fromkeys(("simulation", "learning", "label", "evaluation"), 0.0)
+
+    def total(self) -> float:
+        """Seconds of the whole run, those before a resume included."""
+        return self._before + time.perf_counter() - self._begin
+
+    @contextmanager
+    def measure(self, activity: str) -> Iterator[None]:
+        """Count what happens inside as that activity."""
+        begin = time.perf_counter()
+        yield
+        self._spent[activity] += time.perf_counter() - begin
+
+    def metrics(self, train_steps: int) -> dict[str, float]:
+        """total in seconds, fps in training steps per second of the whole run, and the shares
+        of this process's time."""
+        here = time.perf_counter() - self._begin
+        shares = {f"{name}_share": spent / here for name, spent in self._spent.items()}
+        return {"total": self.total(), "fps": train_steps / self.total()} | shares
+
+
+class Stop:
+    """Turns Ctrl-C and `kill` into a wish that the loop grants after its iteration.
+
+    A second Ctrl-C ends at once. Installs its handlers on entry and puts the old ones back.
+    """
+
+    def __init__(self) -> None:
+        self.signal: int | None = None
+
+    @property
+    def requested(self) -> bool:
+        """Whether the run shall end."""
+        return self.signal is not None
+
+    def __enter__(self) -> "Stop":
+        self._old = {s: signal.signal(s, self._note) for s in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._old.items():
+            signal.signal(number, handler)
+
+    def _note(self, number: int, _: FrameType | None) -> None:
+        if self.requested and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.signal = number
+
+
+def main() -> int:
+    """The command line; returns the exit code."""
+    folder = None
+    try:
+        with Stop() as stop:
+            cfg = config.from_command_line()
+            env = make_env(cfg, 1)
+            folder = cfg.resume or record.create_folder(cfg.out, env.name, cfg.seed)
+            config.save(cfg, folder)
+            record.write_meta(folder, env.maze)
+            say(f"run folder: {folder}")
+            coverage, steps = train(cfg, folder, stop)
+    except KeyboardInterrupt:
+        kept = "" if folder is None else f"; --resume {folder} goes on from the last checkpoint"
+        complain(f"interrupted{kept}")
+        return 130
+    except (ValueError, OSError) as error:
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+            complain(f"the disk is full: free some space, then go on with --resume {folder}")
+        elif isinstance(error, (config.ConfigError, record.RunError, MapError, OSError)):
+            complain(str(error))
+        else:
+            raise
+        return 2
+    if stop.signal is not None:
+        complain(f"stopped by {signal.Signals(stop.signal).name}: go on with --resume {folder}")
+        return 130 if stop.signal == signal.SIGINT else 2
+    say(f"coverage {coverage:.3f} after {steps:,} training steps: {folder}")
+    return 0
+
+
+def script() -> None:
+    """Entry point of the `goalgan-bt` command."""
+    sys.exit(main())
+
+
+if __name__ == "__main__":
+    script()

@@ -1,0 +1,178 @@
+"""Trust region policy optimisation (Schulman et al. 2015).
+
+Maximise the surrogate E[ratio * A] subject to mean KL(old || new) <= max_kl: the conjugate
+gradient finds the natural gradient F^-1 g, a quadratic model scales it to the bound, and a line
+search accepts the longest step whose surrogate rose and whose measured KL keeps the bound.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
+
+from goalgan_bt.policy import GaussianPolicy, log_prob, mean_kl
+
+
+@dataclass(frozen=True)
+class TrpoConfig:
+    """Trust region policy optimisation (Schulman et al. 2015)."""
+
+    max_kl: float = 0.03
+    """Bound on the mean KL of one update, nats (the original: 0.01)."""
+    cg_iters: int = 10
+    """Conjugate gradient iterations."""
+    cg_damping: float = 0.01
+    """Added to the Fisher matrix's diagonal."""
+    fisher_fraction: float = 0.2
+    """Share of the batch on which Fisher-vector products are taken (the original: 1)."""
+    line_search_steps: int = 10
+    """Step lengths tried before the update is given up."""
+    line_search_decay: float = 0.7
+    """Factor between two step lengths."""
+
+
+def conjugate_gradient(
+    product: Callable[[Tensor], Tensor], b: Tensor, iters: int, tolerance: float = 1e-10
+) -> Tensor:
+    """Solve A x = b for a symmetric positive definite A given as x -> A x, (p,) -> (p,)."""
+    x, residual, direction = torch.zeros_like(b), b.clone(), b.clone()
+    norm = residual @ residual
+    for _ in range(iters):
+        image = product(direction)
+        curvature = direction @ image
+        if not curvature > 0:  # rounding, or not a number: what there is so far is the answer
+            break
+        step = norm / curvature
+        x += step * direction
+        residual -= step * image
+        new_norm = residual @ residual
+        if new_norm < tolerance:
+            break
+        direction = residual + (new_norm / norm) * direction
+        norm = new_norm
+    return x
+
+
+def fisher_vector_product(
+    policy: GaussianPolicy, normalised: Tensor, damping: float
+) -> Callable[[Tensor], Tensor]:
+    """v -> (F + damping) v with F the Hessian of the mean KL at the present policy.
+
+    For a Gaussian whose std does not depend on the state, F = J' diag(1/var) J / n for the mean
+    network's parameters, with J the Jacobian of the means, and 2 for each log std.
+
+    Args:
+        policy: pi.
+        normalised: (n, obs_dim) normalised observations.
+        damping: added to the diagonal.
+    """
+    params = list(policy.net.parameters())
+    mean, log_std = policy(normalised)
+    precision = torch.exp(-2 * log_std).detach() / len(mean)
+    # J'u is linear in u, so that its derivative along v is Jv (the double-backward trick).
+    u = torch.zeros_like(mean, requires_grad=True)
+    jt_u = torch.autograd.grad(mean, params, u, create_graph=True)
+    flat_jt_u = torch.cat([g.reshape(-1) for g in jt_u])
+    free = (log_std.detach() == policy.log_std.detach()).float()  # 0 where the floor holds it
+    split = len(flat_jt_u)
+
+    def product(v: Tensor) -> Tensor:
+        (jv,) = torch.autograd.grad(flat_jt_u, u, v[:split], retain_graph=True)
+        jt_jv = torch.autograd.grad(mean, params, precision * jv, retain_graph=True)
+        net_part = torch.cat([g.reshape(-1) for g in jt_jv])
+        return torch.cat([net_part, 2.0 * free * v[split:]]) + damping * v
+
+    return product
+
+
+def line_search(
+    evaluate: Callable[[Tensor], tuple[float, float]],
+    start: Tensor,
+    full_step: Tensor,
+    max_kl: float,
+    steps: int,
+    decay: float,
+) -> tuple[Tensor, float, float] | None:
+    """The longest of full_step * decay^k with a higher surrogate and KL <= max_kl, or None.
+
+    Args:
+        evaluate: parameters (p,) -> (surrogate gain over the start, KL); NaN never passes.
+        start, full_step: (p,).
+        max_kl, steps, decay: see `TrpoConfig`.
+
+    Returns:
+        The accepted parameters, their surrogate gain and their KL.
+    """
+    for k in range(steps):
+        candidate = start + decay**k * full_step
+        gain, kl = evaluate(candidate)
+        if gain > 0 and kl <= max_kl:
+            return candidate, gain, kl
+    return None
+
+
+def update(
+    policy: GaussianPolicy,
+    normalised: Tensor,
+    actions: Tensor,
+    advantages: Tensor,
+    cfg: TrpoConfig,
+    generator: torch.Generator | None = None,
+) -> dict[str, float]:
+    """One trust-region step on a batch that the present policy sampled.
+
+    Args:
+        policy: pi, changed in place; not at all if no step was accepted or any was not finite.
+        normalised: (n, obs_dim) normalised observations.
+        actions: (n, act_dim) as sampled, before clipping.
+        advantages: (n,), normalised here.
+        cfg: settings.
+        generator: picks the subsample of the Fisher matrix.
+
+    Returns:
+        surrogate (its gain), kl, gradient_norm, accepted (1 or 0), nonfinite (1 or 0).
+    """
+    names = [policy.net.parameters(), [policy.log_std]]
+    params = [p for group in names for p in group]
+    advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+    mean, log_std = policy(normalised)
+    logp = log_prob(mean, log_std, actions)
+    old_mean, old_log_std, old_logp = mean.detach(), log_std.detach(), logp.detach()
+
+    surrogate = (torch.exp(logp - old_logp) * advantages).mean()
+    grads = torch.autograd.grad(surrogate, params)
+    gradient = torch.cat([g.reshape(-1) for g in grads])
+    stats = {"surrogate": 0.0, "kl": 0.0, "accepted": 0.0, "nonfinite": 0.0}
+    stats["gradient_norm"] = gradient.norm().item()
+
+    subset = normalised
+    if cfg.fisher_fraction < 1:
+        size = max(1, int(cfg.fisher_fraction * len(normalised)))
+        subset = normalised[torch.randperm(len(normalised), generator=generator)[:size]]
+    product = fisher_vector_product(policy, subset, cfg.cg_damping)
+    direction = conjugate_gradient(product, gradient, cfg.cg_iters)
+    curvature = direction @ product(direction)  # g' F^-1 g
+    full_step = direction * torch.sqrt(2 * cfg.max_kl / (curvature + 1e-12))
+    if not torch.isfinite(full_step).all():
+        return stats | {"nonfinite": 1.0}
+
+    start = parameters_to_vector(params).detach()
+
+    @torch.no_grad()
+    def evaluate(candidate: Tensor) -> tuple[float, float]:
+        vector_to_parameters(candidate, params)
+        new_mean, new_log_std = policy(normalised)
+        new_logp = log_prob(new_mean, new_log_std, actions)
+        gain = ((torch.exp(new_logp - old_logp) - 1) * advantages).mean()
+        return gain.item(), mean_kl(old_mean, old_log_std, new_mean, new_log_std).item()
+
+    found = line_search(
+        evaluate, start, full_step, cfg.max_kl, cfg.line_search_steps, cfg.line_search_decay
+    )
+    if found is None:
+        vector_to_parameters(start, params)
+        return stats
+    _, gain, kl = found  # the last evaluation left the accepted parameters in place
+    return stats | {"surrogate": gain, "kl": kl, "accepted": 1.0}

@@ -1,0 +1,1 @@
+"""Pictures of runs: read run folders, know nothing of the learner."""
