@@ -168,20 +168,20 @@ class Maze:
         position, stopped = before.copy(), np.zeros(before.shape, dtype=bool)
         inner = radius * (1 - 1e-9)  # a body that touches a wall beside it may move along it
         for axis in (0, 1):
-            position[:, axis] = after[:, axis]
-            for side in (-1, 1):
-                corner = position.copy()
-                corner[:, axis] += side * radius
-                blocked = np.zeros(len(before), dtype=bool)
-                for edge in (-inner, inner):
-                    corner[:, 1 - axis] = position[:, 1 - axis] + edge
-                    blocked |= ~self.is_free(corner)
-                # Distance from the leading corner back to the border of its cell.
-                into = (corner[:, axis] - self.low[axis]) % self.cell_size
-                if side < 0:
-                    into = self.cell_size - into
-                position[:, axis] -= np.where(blocked, side * (into + 1e-9), 0.0)
-                stopped[:, axis] |= blocked
+            move = after[:, axis] - before[:, axis]
+            side = np.where(move < 0, -1.0, 1.0)
+            corner = position.copy()
+            corner[:, axis] = after[:, axis] + side * radius
+            blocked = np.zeros(len(before), dtype=bool)
+            for edge in (-inner, inner):
+                corner[:, 1 - axis] = position[:, 1 - axis] + edge
+                blocked |= ~self.is_free(corner)
+            # How far the leading edge went into the cell that it must not enter.
+            into = (corner[:, axis] - self.low[axis]) % self.cell_size
+            into = np.where(side > 0, into, self.cell_size - into)
+            back = np.where(blocked, np.minimum(into + 1e-9, np.abs(move)), 0.0)
+            position[:, axis] = after[:, axis] - side * back
+            stopped[:, axis] = blocked
         return position, stopped
 
 

@@ -145,6 +145,8 @@ def check(cfg: Config) -> None:
             if value is not None and not good(value):
                 flag = name.replace("_", "-")
                 raise ConfigError(f"--{flag} must be {what}, not {value}")
+    if not 2 <= cfg.dim <= 6:
+        raise ConfigError(f"--dim must be 2 to 6, not {cfg.dim}")
     if cfg.goals.r_min >= cfg.goals.r_max:
         raise ConfigError("--goals.r-min must be less than --goals.r-max")
 
@@ -200,6 +202,8 @@ def load(folder: Path) -> Config:
 
 def _build(kind: type[Any], values: dict[str, Any]) -> Any:
     """A dataclass from what `asdict` and JSON made of it."""
+    if not isinstance(values, dict):
+        raise TypeError(f"expected settings, found {values!r}")
     hints = typing.get_type_hints(kind)
     known = {f.name for f in fields(kind)}
     if unknown := set(values) - known:

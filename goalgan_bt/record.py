@@ -41,8 +41,9 @@ def create_folder(out: Path, env: str, seed: int) -> Path:
             (folder / "frames").mkdir(parents=True)
             return folder
         except FileExistsError:
-            if not folder.exists():  # `out` itself, or a part of it, is a file
-                break
+            continue
+        except NotADirectoryError:
+            break
     raise RunError(f"cannot make a run folder in {out}: choose another with --out")
 
 

@@ -134,8 +134,7 @@ def update(
     Returns:
         surrogate (its gain), kl, gradient_norm, accepted (1 or 0), nonfinite (1 or 0).
     """
-    names = [policy.net.parameters(), [policy.log_std]]
-    params = [p for group in names for p in group]
+    params = [*policy.net.parameters(), policy.log_std]
     advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
     mean, log_std = policy(normalised)
     logp = log_prob(mean, log_std, actions)
@@ -146,6 +145,8 @@ def update(
     gradient = torch.cat([g.reshape(-1) for g in grads])
     stats = {"surrogate": 0.0, "kl": 0.0, "accepted": 0.0, "nonfinite": 0.0}
     stats["gradient_norm"] = gradient.norm().item()
+    if not torch.isfinite(gradient).all():
+        return stats | {"nonfinite": 1.0}
 
     subset = normalised
     if cfg.fisher_fraction < 1:

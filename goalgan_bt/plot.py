@@ -1,0 +1,48 @@
+"""A first look at runs: coverage over steps and over the maze, as a PNG.
+
+python -m goalgan_bt.plot runs/ant_umaze-20261122-101500-s0
+"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from goalgan_bt.progress import complain, say
+from goalgan_bt.record import RunError
+
+
+@dataclass(frozen=True)
+class PlotConfig:
+    """Draw coverage curves and coverage maps of one or several runs."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folders."""
+    out: Path | None = None
+    """PNG to write; by default coverage.png in the first run folder."""
+    maps: int = 4
+    """Coverage maps per run, spread over training."""
+
+
+def main() -> int:
+    """The command line; returns the exit code."""
+    cfg = tyro.cli(PlotConfig, prog="python -m goalgan_bt.plot", description=__doc__)
+    try:
+        if not cfg.runs or cfg.maps < 1:
+            raise RunError("name at least one run folder, and ask for at least one map")
+        try:
+            from goalgan_bt.viz import pictures
+        except ImportError:
+            raise RunError('plots need matplotlib: pip install "goalgan_bt[plots]"') from None
+        path = cfg.out or cfg.runs[0] / "coverage.png"
+        pictures.overview(list(cfg.runs), cfg.maps).savefig(path, dpi=150)
+    except (RunError, OSError) as error:
+        complain(str(error))
+        return 2
+    say(str(path))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,77 @@
+import json
+
+import pytest
+
+from goalgan_bt import config, envs
+from goalgan_bt.config import ConfigError
+
+
+@pytest.mark.parametrize("name", envs.NAMES)
+def test_every_environment_has_a_preset_that_can_be_run(name):
+    cfg = config.preset(name)
+    config.check(cfg)
+    assert cfg.env == name
+    assert cfg.backtracking.trace_length == (50 if name.startswith("ant") else 20)
+
+
+@pytest.mark.parametrize("env", ["point_umaze", "ant_umaze"])
+def test_the_command_line_overrides_the_preset(env):
+    flags = ["--backtracking.trace-length", "7", f"--env={env}", "--trpo.max-kl", "0.5"]
+    cfg = config.from_command_line(flags)
+    assert (cfg.env, cfg.backtracking.trace_length, cfg.trpo.max_kl) == (env, 7, 0.5)
+    assert cfg.total_steps == config.preset(env).total_steps
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--env", "ant_nowhere"], "unknown environment 'ant_nowhere': choose one of"),
+        (["--total-steps", "-5"], "--total-steps must be greater than 0, not -5"),
+        (["--trpo.max-kl", "0"], "--trpo.max-kl must be greater than 0"),
+        (["--discount", "1.5"], "--discount must be between 0 and 1"),
+        (["--backtracking.trace-length", "-1"], "--backtracking.trace-length must be 0 or more"),
+        (["--goals.r-min", "0.9"], "--goals.r-min must be less"),
+        (["--no-such-flag", "1"], "no-such-flag"),
+        (["--seed", "three"], "three"),
+        (["--resume", "nowhere"], "nowhere is no run"),
+    ],
+)
+def test_bad_flags_are_one_clear_line(flags, message):
+    with pytest.raises(ConfigError) as error:
+        config.from_command_line(flags)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_settings_survive_the_run_folder(tmp_path):
+    cfg = config.from_command_line(["--env", "point_umaze", "--policy.hidden", "8", "9", "--out", "x"])
+    config.save(cfg, tmp_path)
+    assert config.load(tmp_path) == cfg
+
+
+def test_resume_starts_from_the_runs_settings(tmp_path):
+    config.save(config.from_command_line(["--env", "point_spiral", "--seed", "3"]), tmp_path)
+    cfg = config.from_command_line(["--resume", str(tmp_path), "--iterations", "9"])
+    assert (cfg.env, cfg.seed, cfg.iterations) == ("point_spiral", 3, 9)
+    with pytest.raises(ConfigError, match="drop --env"):
+        config.from_command_line(["--resume", str(tmp_path), "--env", "ant_umaze"])
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"nonsense": 1}', '{"trpo": 3}'])
+def test_damaged_settings_are_refused(tmp_path, text):
+    (tmp_path / "config.json").write_text(text)
+    with pytest.raises(ConfigError, match=r"config\.json"):
+        config.load(tmp_path)
+
+
+def test_help_explains_every_setting(capsys):
+    with pytest.raises(SystemExit) as stop:
+        config.from_command_line(["--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    assert "--backtracking.trace-length" in text and "--rollout.chain" in text
+    settings = json.loads(json.dumps(config.asdict(config.ANT), default=str))
+    for name, value in settings.items():
+        flags = value if isinstance(value, dict) else {"": None}
+        for flag in flags:
+            assert "--" + ".".join(filter(None, [name, flag])).replace("_", "-") in text

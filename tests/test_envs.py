@@ -1,0 +1,244 @@
+"""The worlds: physics against MuJoCo itself, the reward, resets, walls."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from goalgan_bt import envs
+from goalgan_bt.envs.maze import MapError
+
+ALL = ["point_umaze", "ant_umaze", "point_nd"]
+
+
+def everyone(env):
+    return np.arange(env.num_envs)
+
+
+@pytest.mark.parametrize("name", envs.NAMES)
+def test_every_environment_steps(name):
+    env = envs.make(name, 4, threads=1)
+    rng = np.random.default_rng(0)
+    ids = everyone(env)
+    env.reset(ids, env.test_goals()[-4:])
+    for _ in range(5):
+        states, step = env.step(ids, rng.uniform(-1, 1, (4, env.act_dim)))
+        assert states.shape == (4, env.state_dim)
+        assert env.observe(ids).shape == (4, env.obs_dim)
+        assert env.observe(ids).dtype == np.float32
+    assert env.elapsed.tolist() == [5] * 4
+    assert np.isfinite(states).all()
+    assert step.rewards.dtype == np.float32
+    assert env.feasible(env.test_goals()).all()
+
+
+def test_settings_of_the_paper():
+    point, ant = envs.make("point_umaze", 1), envs.make("ant_umaze", 1)
+    assert (point.horizon, ant.horizon) == (200, 500)
+    assert (point.success_radius, ant.success_radius) == (0.3, 1.0)
+    assert point.dt == ant.dt == 0.02
+    assert point.model.body_mass.sum() == pytest.approx(0.419, abs=1e-3)
+    assert ant.model.body_mass.sum() == pytest.approx(0.911, abs=1e-3)
+    assert ant.start_state[:15].tolist() == [0, 0, 0.55, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1]
+    assert (ant.model.actuator_gear[:, 0] == 150).all()
+    assert envs.make("point_spiral", 1).horizon == 500  # as the original
+
+
+@pytest.mark.parametrize("dim", [2, 3, 4, 5, 6])
+def test_point_nd_sizes(dim):
+    env = envs.make("point_nd", 3, dim=dim)
+    assert (env.goal_dim, env.act_dim, env.obs_dim) == (dim, dim, 3 * dim)
+    assert env.success_radius == pytest.approx(0.3 * np.sqrt(dim / 2))
+    env.reset(everyone(env), env.test_goals()[:3])
+    for _ in range(300):
+        states, _ = env.step(everyone(env), np.ones((3, dim)))
+    assert np.allclose(states[:, :dim], ([1.0, 5.0] + [0.3] * 4)[:dim])
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [({"name": "ant_nowhere"}, "unknown environment"), ({"name": "point_nd", "dim": 7}, "2 to 6")],
+)
+def test_bad_names(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        envs.make(num_envs=1, **kwargs)
+
+
+def test_a_users_map(tmp_path):
+    path = tmp_path / "hall.txt"
+    path.write_text("######\n#S...#\n######\n")
+    env = envs.make("point_umaze", 2, map_file=path)
+    assert env.name == "point_hall" and len(env.test_goals()) == 64
+    path.write_text("######\n#S..x#\n######\n")
+    with pytest.raises(MapError, match="row 2, column 5"):
+        envs.make("ant_umaze", 2, map_file=path)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_state_has_one_future(name):
+    """Reading a state and writing it elsewhere gives the same trajectory, bit for bit."""
+    env = envs.make(name, 6, threads=2)
+    rng = np.random.default_rng(1)
+    ids = everyone(env)
+    env.reset(ids, np.zeros((6, env.goal_dim)))
+    for _ in range(30):
+        env.step(ids, rng.uniform(-1, 1, (6, env.act_dim)))
+    states = env.read_states(ids)
+    futures = []
+    for _ in range(2):
+        replay = np.random.default_rng(2)
+        env.reset(ids, np.zeros((6, env.goal_dim)), states)
+        assert np.array_equal(env.read_states(ids), states)
+        for _ in range(20):
+            final, _ = env.step(ids, replay.uniform(-1, 1, (6, env.act_dim)))
+        futures.append(final)
+    assert np.array_equal(*futures)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_one_simulation_does_not_touch_another(name):
+    env = envs.make(name, 4, threads=1)
+    ids = everyone(env)
+    env.reset(ids, np.zeros((4, env.goal_dim)))
+    some = np.array([1, 3])
+    for _ in range(10):
+        env.step(some, np.ones((2, env.act_dim)))
+    states = env.read_states(ids)
+    assert np.array_equal(states[[0, 2]], np.tile(env.start_state, (2, 1)))
+    assert not np.array_equal(states[1], env.start_state)
+    env.reset(np.array([3]), np.ones((1, env.goal_dim)))
+    assert np.array_equal(env.read_states(ids)[3], env.start_state)
+    assert np.array_equal(env.read_states(ids)[1], states[1])
+    assert env.elapsed.tolist() == [0, 10, 0, 0]
+
+
+def test_threads_do_not_change_the_physics():
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (40, 8, 8))
+    finals = []
+    for threads in (1, 2):
+        env = envs.make("ant_umaze", 8, threads=threads)
+        env.reset(everyone(env), np.zeros((8, 2)))
+        for a in actions:
+            states, _ = env.step(everyone(env), a)
+        finals.append(states)
+    assert np.array_equal(*finals)
+
+
+@pytest.mark.parametrize("name", ["point_umaze", "ant_umaze"])
+def test_batched_physics_is_mujocos(name):
+    """Away from walls, the batch does what one MjData does under mj_step."""
+    env = envs.make(name, 1, threads=1)
+    env.reset(np.array([0]), np.full((1, 2), 6.0))
+    data = mujoco.MjData(env.model)
+    data.qpos[:], data.qvel[:] = np.split(env.start_state, [env.model.nq])
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        action = rng.uniform(-1, 1, env.act_dim)
+        states, _ = env.step(np.array([0]), action[None])
+        data.ctrl[:] = action
+        mujoco.mj_step(env.model, data)
+    assert np.array_equal(states[0], np.concatenate([data.qpos, data.qvel]))
+
+
+def test_the_ants_achieved_goal_is_mujocos_centre_of_mass():
+    env = envs.make("ant_umaze", 32, threads=1)
+    rng = np.random.default_rng(0)
+    env.reset(everyone(env), np.zeros((32, 2)))
+    for _ in range(50):
+        states, _ = env.step(everyone(env), rng.uniform(-1, 1, (32, 8)))
+    data = mujoco.MjData(env.model)
+    torso = env.model.body("torso").id
+    for state, achieved in zip(states, env.achieved_goals(states), strict=True):
+        data.qpos[:] = state[:15]
+        mujoco.mj_kinematics(env.model, data)
+        mujoco.mj_comPos(env.model, data)
+        assert achieved == pytest.approx(data.subtree_com[torso][:2], abs=1e-9)
+
+
+def test_how_far_implicitfast_is_from_rk4():
+    """The default integrator against the original's, same actions: mean distance in metres."""
+
+    def apart(name, steps):
+        finals = []
+        for integrator in ("implicitfast", "rk4"):
+            env = envs.make(name, 64, threads=1, integrator=integrator)
+            rng = np.random.default_rng(0)
+            env.reset(everyone(env), np.full((64, 2), 6.0))
+            for _ in range(steps):
+                states, _ = env.step(everyone(env), rng.uniform(-1, 1, (64, env.act_dim)))
+            finals.append(env.achieved_goals(states))
+        return np.linalg.norm(finals[0] - finals[1], axis=1).mean()
+
+    # Measured: the point 3.7 mm after half a second; the Ant 4.3 mm after 0.1 s and 80 mm after
+    # half a second, since its contacts multiply any difference.
+    assert 0 < apart("point_umaze", 25) < 0.006
+    assert 0 < apart("ant_umaze", 5) < 0.01
+    assert 0 < apart("ant_umaze", 25) < 0.2
+
+
+def test_reward_success_and_end():
+    env = envs.make("point_umaze", 3, threads=1)
+    ids = everyone(env)
+    # In reach; free but far; in reach, but inside the wall: never reached.
+    goals = np.array([[0.2, 0.0], [4.0, 4.0], [0.0, 1.05]])
+    start = np.zeros((3, 4))
+    start[2, 1] = 0.85
+    env.reset(ids, goals, start)
+    _, step = env.step(ids, np.zeros((3, 2)))
+    assert step.rewards.tolist() == [1, 0, 0]
+    assert step.terminated.tolist() == [True, False, False]
+    assert not step.truncated.any()
+    for _ in range(env.horizon - 1):
+        _, step = env.step(ids[1:], np.zeros((2, 2)))
+    assert step.truncated.all() and not step.terminated.any()
+
+
+def test_an_ant_that_leaves_its_height_fails_without_reward():
+    env = envs.make("ant_umaze", 4, threads=1)
+    ids = everyone(env)
+    states = np.tile(env.start_state, (4, 1))
+    states[1, 2] = 0.2
+    states[2, 2] = 1.2
+    states[3, 20] = np.nan
+    env.reset(ids, np.zeros((4, 2)), states)
+    _, step = env.step(ids, np.zeros((4, 8)))
+    assert step.rewards.tolist() == [1, 0, 0, 0]
+    assert step.terminated.all()
+    # A diverged simulation recovers at its reset and hurt no other.
+    env.reset(np.array([3]), np.full((1, 2), 6.0))
+    states, step = env.step(ids[3:], np.zeros((1, 8)))
+    assert np.isfinite(states).all() and not step.terminated.any()
+
+
+def test_observation_is_state_and_goal():
+    env = envs.make("ant_umaze", 1)
+    states = np.tile(env.start_state, (2, 1))
+    half = np.sqrt(0.5)
+    states[1, 3:7] = half, 0, 0, half  # turned left by 90 degrees
+    com = env.achieved_goals(states)
+    goals = com + (2.0, 1.0)
+    obs = env.observations(states, goals)
+    assert np.allclose(obs[:, :29], states, atol=1e-6)
+    assert np.allclose(obs[:, 29:31], [2, 1])  # in the world's frame
+    assert np.allclose(obs[0, 31:33], [2, 1], atol=1e-6)  # ahead and to the left
+    assert np.allclose(obs[1, 31:33], [1, -2], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_place_puts_a_state_onto_a_goal(name):
+    env = envs.make(name, 1)
+    rng = np.random.default_rng(0)
+    states = np.tile(env.start_state, (5, 1))
+    goals = rng.uniform(-0.5, 0.5, (5, env.goal_dim))
+    placed = env.place(states, goals)
+    assert np.allclose(env.achieved_goals(placed), goals)
+    moved = np.abs(placed - states).max(axis=0) > 1e-12
+    assert moved.sum() == env.goal_dim  # nothing else changed
+
+
+def test_valid_ant_states_keep_torso_and_feet_out_of_walls():
+    env = envs.make("ant_umaze", 1)
+    states = np.tile(env.start_state, (3, 1))
+    states[1, 1] = 0.8  # the torso's rim is in the wall above the start
+    states[2, 1] = 0.5  # the torso is clear, two feet are not
+    assert env.valid(states).tolist() == [True, False, False]

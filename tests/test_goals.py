@@ -1,0 +1,66 @@
+import numpy as np
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from goalgan_bt.goals import GoalReplay, GoalsConfig, SuccessEstimator, intermediate
+
+
+def test_label_edges_are_strict():
+    success = np.array([0.0, 0.1, 0.1001, 0.5, 0.8999, 0.9, 1.0])
+    assert intermediate(success, 0.1, 0.9).tolist() == [False, False, True, True, True, False, False]
+
+
+points = st.lists(st.tuples(st.floats(-5, 5), st.floats(-5, 5)), max_size=40)
+
+
+@settings(deadline=None)
+@given(points, points)
+def test_replayed_goals_keep_their_distance(first, second):
+    replay = GoalReplay(2, 0.3)
+    for goals in (first, second):
+        replay.add(np.array(goals).reshape(-1, 2))
+    kept = replay.goals
+    gaps = np.linalg.norm(kept[:, None] - kept, axis=2) + np.eye(len(kept))
+    assert (gaps > 0.3).all()
+    # Whatever was left out is close to something that was kept.
+    for goal in [*first, *second]:
+        assert (np.linalg.norm(kept - goal, axis=1) <= 0.3).any()
+
+
+def test_replay_draws_without_repetition():
+    replay = GoalReplay(1, 0.3)
+    rng = np.random.default_rng(0)
+    assert replay.sample(5, rng).shape == (0, 1)
+    replay.add(np.arange(10.0)[:, None])
+    assert sorted(replay.sample(100, rng)[:, 0]) == list(range(10))
+    assert len(np.unique(replay.sample(4, rng))) == 4
+
+
+def make_estimator(**kwargs):
+    torch.manual_seed(0)
+    low, high = np.zeros(2), np.full(2, 10.0)
+    return SuccessEstimator(low, high, GoalsConfig(**kwargs), torch.Generator().manual_seed(0))
+
+
+def test_the_estimator_learns_how_hard_goals_are():
+    """Success falls linearly with x: from one episode per goal it finds the share."""
+    estimator = make_estimator(estimator_steps=400)
+    rng = np.random.default_rng(0)
+    goals = rng.uniform(0, 10, (3000, 2))
+    estimator.add(goals, rng.random(3000) > goals[:, 0] / 10)
+    estimator.fit()
+    test = rng.uniform(1, 9, (500, 2))
+    assert np.abs(estimator(test) - (1 - test[:, 0] / 10)).mean() < 0.07
+
+
+def test_the_estimator_forgets_old_episodes():
+    estimator = make_estimator(episodes=100)
+    estimator.add(np.zeros((300, 2)), np.zeros(300, dtype=bool))
+    estimator.add(np.ones((60, 2)), np.ones(60, dtype=bool))
+    assert len(estimator.goals) == 100
+    assert estimator.success.sum() == 60
+
+
+def test_an_estimator_without_episodes_has_nothing_to_fit():
+    assert make_estimator().fit() == {}

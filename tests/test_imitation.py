@@ -1,0 +1,41 @@
+import pytest
+import torch
+
+from goalgan_bt.imitation import Imitation, ImitationConfig
+from goalgan_bt.policy import GaussianPolicy, PolicyConfig, log_prob, mean_kl
+
+
+def make(**settings):
+    torch.manual_seed(0)
+    policy = GaussianPolicy(4, 2, PolicyConfig(hidden=(32,)))
+    return policy, Imitation(policy, ImitationConfig(**settings), torch.Generator().manual_seed(0))
+
+
+def test_recalled_actions_become_likelier_and_the_std_stays():
+    policy, imitation = make(steps=200, learning_rate=1e-2, max_kl=100.0)
+    obs = torch.randn(300, 4)
+    actions = torch.stack([obs[:, 0], -obs[:, 1]], dim=1).clamp(-1, 1)
+    before = log_prob(*policy(obs), actions).mean().item()
+    std = policy.log_std.clone()
+    stats = imitation.update(obs, actions, obs)
+    assert stats["steps"] == 200
+    assert -stats["loss"] == pytest.approx(before, abs=0.2)
+    assert log_prob(*policy(obs), actions).mean().item() > before + 0.3
+    assert torch.equal(std, policy.log_std)
+
+
+def test_the_kl_bound_holds_and_says_so():
+    policy, imitation = make(steps=200, learning_rate=1e-2, max_kl=0.01)
+    obs, reference = torch.randn(300, 4), torch.randn(500, 4)
+    mean, log_std = (x.detach().clone() for x in policy(reference))
+    stats = imitation.update(obs, torch.ones(300, 2), reference)
+    kl = mean_kl(mean, log_std, *policy(reference)).item()
+    assert 0 < stats["steps"] < 200
+    assert 0 < kl <= 0.01 and stats["kl"] == pytest.approx(kl)
+
+
+def test_no_traces_change_nothing():
+    policy, imitation = make()
+    before = [p.clone() for p in policy.parameters()]
+    assert imitation.update(torch.empty(0, 4), torch.empty(0, 2), torch.randn(5, 4)) == {}
+    assert all(torch.equal(a, b) for a, b in zip(before, policy.parameters(), strict=True))

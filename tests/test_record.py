@@ -1,0 +1,97 @@
+import csv
+
+import numpy as np
+import pytest
+
+from goalgan_bt import record
+from goalgan_bt.envs import maze as mazes
+from goalgan_bt.record import Record, RunError
+
+
+def row(iteration, **more):
+    return {"iteration": iteration, "steps/train": 100 * iteration, **more}
+
+
+def cells(folder):
+    with (folder / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_columns_grow_without_losing_a_value(tmp_path):
+    records = Record(tmp_path)
+    records.metrics(row(1))
+    records.metrics(row(2, **{"eval/coverage": 0.5}))
+    records.metrics(row(3, **{"trpo/kl": float("nan"), "gan/loss": 1.25}))
+    records.metrics(row(4))
+    table = cells(tmp_path)
+    assert [r["iteration"] for r in table] == ["1", "2", "3", "4"]
+    assert [r["eval/coverage"] for r in table] == ["", "0.5", "", ""]
+    assert table[2]["gan/loss"] == "1.25" and table[2]["trpo/kl"] == ""
+    columns, rows = record.read_metrics(tmp_path)
+    assert columns[:2] == ["iteration", "steps/train"] and len(rows) == 4
+
+
+def test_a_resumed_record_drops_what_came_after_its_checkpoint(tmp_path):
+    records = Record(tmp_path)
+    for i in range(1, 6):
+        records.metrics(row(i))
+        records.frame(i, goals=np.zeros((1, 2)))
+    resumed = Record(tmp_path, iteration=3)
+    resumed.metrics(row(4, new=1.0))
+    assert [r["iteration"] for r in cells(tmp_path)] == ["1", "2", "3", "4"]
+    assert [f.stem for f in record.frames(tmp_path)] == ["000001", "000002", "000003"]
+
+
+def test_a_last_row_cut_short_is_left_out(tmp_path):
+    records = Record(tmp_path)
+    records.metrics(row(1, x=1.0))
+    records.metrics(row(2, x=2.0))
+    path = tmp_path / "metrics.csv"
+    path.write_text(path.read_text().rsplit(",", 1)[0])
+    assert len(record.read_metrics(tmp_path)[1]) == 1
+
+
+def test_frames_round_trip(tmp_path):
+    records = Record(tmp_path)
+    traces = np.full((2, 3, 2), np.nan, np.float32)
+    records.frame(7, goals=np.eye(2), traces=traces)
+    (path,) = record.frames(tmp_path)
+    with np.load(path, allow_pickle=False) as frame:
+        assert np.array_equal(frame["goals"], np.eye(2))
+        assert np.array_equal(frame["traces"], traces, equal_nan=True)
+
+
+def test_an_interrupted_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "file"
+    path.write_bytes(b"old")
+
+    def fail(file):
+        file.write(b"ne")
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        record.write_atomically(path, fail)
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_folders_of_the_same_second_do_not_collide(tmp_path):
+    folders = {record.create_folder(tmp_path, "ant_umaze", 3) for _ in range(3)}
+    assert len(folders) == 3
+    assert all(f.name.startswith("ant_umaze-") and "-s3" in f.name for f in folders)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunError, match="--out"):
+        record.create_folder(tmp_path / "file", "ant_umaze", 0)
+
+
+def test_meta_holds_the_maze_and_the_versions(tmp_path):
+    record.write_meta(tmp_path, mazes.layout("spiral"))
+    meta = record.read_meta(tmp_path)
+    assert tuple(meta["maze"]["rows"]) == mazes.layout("spiral").rows
+    assert meta["versions"]["mujoco"][0].isdigit()
+
+
+@pytest.mark.parametrize("read", [record.read_metrics, record.read_meta])
+def test_a_folder_that_is_no_run_says_so(tmp_path, read):
+    with pytest.raises(RunError, match="is no run"):
+        read(tmp_path)

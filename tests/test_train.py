@@ -1,0 +1,225 @@
+"""The whole thing, small: the real command in a process of its own, and what it leaves behind."""
+
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from goalgan_bt import checkpoint, config, record
+from goalgan_bt.learner import Learner
+from goalgan_bt.record import RunError
+from goalgan_bt.train import make_env, train
+
+TINY = {
+    "point_umaze": "--rollout.num-envs 32 --rollout.steps 50 --backtracking.min-transitions 200",
+    "ant_umaze": "--rollout.num-envs 32 --rollout.steps 50 --backtracking.min-transitions 200",
+    "point_nd": "--rollout.num-envs 32 --rollout.steps 50 --backtracking.min-transitions 200",
+}
+FAST = "--horizon 60 --coverage.rollouts 1 --gan.pretrain-steps 20 --gan.steps 10"
+
+
+def settings(env, *more):
+    words = f"--env {env} {TINY[env]} {FAST} --threads 1 --report-every 1".split()
+    return config.from_command_line([*words, *more])
+
+
+def command(*flags, out):
+    tiny = [*TINY["point_umaze"].split(), *FAST.split()]
+    words = [sys.executable, "-m", "goalgan_bt.train", *map(str, flags), "--out", str(out)]
+    return [*words, *(tiny if "--env" in flags else [])]
+
+
+def run(*flags, out):
+    return subprocess.run(command(*flags, out=out), capture_output=True, text=True, timeout=120)
+
+
+def columns(folder):
+    """metrics.csv without the columns that measure time."""
+    _, rows = record.read_metrics(folder)
+    return [{k: v for k, v in row.items() if not k.startswith("time/")} for row in rows]
+
+
+@pytest.mark.parametrize("env", TINY)
+def test_a_tiny_run_leaves_a_whole_run_folder(env, tmp_path):
+    cfg = settings(env, "--iterations", "6")
+    record.write_meta(tmp_path, None)
+    coverage, steps = train(cfg, tmp_path)
+    assert steps == 7 * 32 * 50  # the first batch made the goals of the first iteration
+    assert 0 <= coverage <= 1
+    rows = columns(tmp_path)
+    assert [int(r["iteration"]) for r in rows] == [1, 2, 3, 4, 5, 6]
+    assert float(rows[-1]["eval/coverage"]) == pytest.approx(coverage, abs=1e-5)
+    assert rows[1]["eval/coverage"] == ""
+    assert int(rows[-1]["steps/train"]) == steps and int(rows[-1]["steps/eval"]) > 0
+    assert int(rows[-1]["steps/label"]) == 0
+    frames = record.frames(tmp_path)
+    assert len(frames) == 6
+    with np.load(frames[-1], allow_pickle=False) as frame:
+        n = len(frame["goals"])
+        assert frame["success"].shape == frame["label"].shape == frame["replayed"].shape == (n,)
+        assert set(np.unique(frame["label"])) <= {-1, 0, 1}
+        assert frame["coverage"].shape == frame["estimate"].shape == (len(frame["test_goals"]),)
+        assert np.nanmean(frame["coverage"]) == pytest.approx(coverage)
+        assert frame["traces"].shape[1] == len(frame["trace_goals"])
+
+
+def test_recall_traces_are_learned_and_imitated(tmp_path):
+    cfg = settings("point_umaze", "--iterations", "25", "--goals.estimator-steps", "5")
+    train(cfg, tmp_path)
+    rows = columns(tmp_path)
+    assert any(r.get("imitation/loss") for r in rows)
+    assert any(r.get("backtracking/state_nll") for r in rows)
+    plain = tmp_path / "plain"
+    plain.mkdir()
+    train(settings("point_umaze", "--iterations", "25", "--backtracking.trace-length", "0"), plain)
+    assert not any(r.get("imitation/loss") for r in columns(plain))
+
+
+def test_fresh_labelling_rollouts_are_counted(tmp_path):
+    cfg = settings("point_umaze", "--iterations", "2", "--goals.label-rollouts", "1")
+    train(cfg, tmp_path)
+    steps = [int(r["steps/label"]) for r in columns(tmp_path)]
+    assert 0 < steps[0] < steps[1] <= 2 * 300 * 60
+
+
+def test_same_seed_same_metrics(tmp_path):
+    results = []
+    for i, seed in enumerate((1, 1, 2)):
+        folder = tmp_path / str(i)
+        folder.mkdir()
+        train(settings("point_umaze", "--iterations", "4", "--seed", str(seed)), folder)
+        results.append(columns(folder))
+    assert results[0] == results[1]
+    assert results[0] != results[2]
+
+
+def test_resume_goes_on_where_the_checkpoint_was(tmp_path):
+    train(settings("point_umaze", "--iterations", "3"), tmp_path)
+    first = columns(tmp_path)
+    cfg = replace(settings("point_umaze", "--iterations", "5"), resume=tmp_path)
+    train(cfg, tmp_path)
+    rows = columns(tmp_path)
+    assert [int(r["iteration"]) for r in rows] == [1, 2, 3, 4, 5]
+    assert rows[:3] == first
+    assert int(rows[4]["steps/train"]) == 6 * 32 * 50
+    assert int(rows[4]["steps/eval"]) > int(rows[2]["steps/eval"])
+
+
+def test_a_checkpoint_holds_everything(tmp_path):
+    train(settings("point_umaze", "--iterations", "3"), tmp_path)
+    cfg = settings("point_umaze", "--seed", "9")
+    env = make_env(cfg, 2)
+    a, b = Learner(env, cfg), Learner(env, cfg)
+    checkpoint.load(a, tmp_path)
+    checkpoint.save(a, tmp_path)
+    checkpoint.load(b, tmp_path)
+    assert a.iteration == b.iteration == 3
+    assert a.rng.random() == b.rng.random()
+    assert torch.equal(a.gan._noise(3), b.gan._noise(3))
+    assert np.array_equal(a.estimator(env.test_goals()), b.estimator(env.test_goals()))
+    assert np.array_equal(a.transitions.states, b.transitions.states)
+    assert torch.equal(a.policy.normaliser.var, b.policy.normaliser.var)
+
+
+@pytest.mark.parametrize("damage", ["missing", "cut", "empty", "other sizes", "pickle"])
+def test_a_damaged_checkpoint_is_refused_in_one_line(tmp_path, damage):
+    cfg = settings("point_umaze", "--iterations", "1")
+    train(cfg, tmp_path)
+    path = tmp_path / "checkpoint.pt"
+    if damage == "missing":
+        path.unlink()
+    elif damage == "cut":
+        path.write_bytes(path.read_bytes()[:5000])
+    elif damage == "empty":
+        path.write_bytes(b"")
+    elif damage == "pickle":
+        torch.save({"modules": print}, path)
+    else:
+        cfg = settings("point_umaze", "--policy.hidden", "5")
+    with pytest.raises(RunError, match="start a new run|cannot resume") as error:
+        checkpoint.load(Learner(make_env(cfg, 2), cfg), tmp_path)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--env", "moon"], "unknown environment 'moon'"),
+        (["--env", "point_umaze", "--iterations", "-3"], "--iterations must be greater than 0"),
+        (["--env", "point_umaze", "--map", "none.txt"], "cannot read the map none.txt"),
+        (["--env", "point_nd", "--dim", "9"], "--dim must be 2 to 6, not 9"),
+        (["--resume", "nowhere"], "nowhere is no run"),
+        (["--frobnicate"], "frobnicate"),
+    ],
+)
+def test_bad_input_ends_in_one_line_and_code_2(flags, message, tmp_path):
+    done = run(*flags, out=tmp_path)
+    assert done.returncode == 2
+    lines = done.stderr.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("error: ") and message in lines[0]
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_broken_map_names_its_place(tmp_path):
+    path = tmp_path / "mine.txt"
+    path.write_text("####\n#SX#\n####\n")
+    done = run("--env", "point_umaze", "--map", path, out=tmp_path / "runs")
+    assert done.returncode == 2
+    assert "mine.txt: row 2, column 3: unknown character 'X'" in done.stderr
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 2)])
+def test_interrupted_runs_leave_a_checkpoint_that_resumes(tmp_path, number, code):
+    process = subprocess.Popen(
+        command("--env", "point_umaze", "--report-every", 1, out=tmp_path),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    folder = process.stdout.readline().removeprefix("run folder: ").strip()
+    for _ in range(3):
+        assert "steps" in process.stdout.readline()
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert len(errors.strip().splitlines()) == 1
+    assert f"--resume {folder}" in errors
+    done = int(columns(tmp_path / folder)[-1]["iteration"])
+    resumed = run("--resume", folder, "--iterations", done + 2, out=tmp_path)
+    assert resumed.returncode == 0, resumed.stderr
+    assert int(columns(tmp_path / folder)[-1]["iteration"]) == done + 2
+
+
+def test_a_full_disk_is_one_line(tmp_path):
+    """/dev/full takes no byte: the run's metrics go there."""
+    process = subprocess.Popen(
+        command("--env", "point_umaze", "--report-every", 1, out=tmp_path),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    folder = process.stdout.readline().removeprefix("run folder: ").strip()
+    process.stdout.readline()
+    path = tmp_path / folder / "metrics.csv"
+    time.sleep(0.1)
+    path.unlink()
+    path.symlink_to("/dev/full")
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "the disk is full" in errors and len(errors.strip().splitlines()) == 1
+
+
+def test_help_shows_defaults_of_the_preset():
+    done = subprocess.run(
+        [sys.executable, "-m", "goalgan_bt.train", "--env", "point_umaze", "--help"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0
+    assert "4000000" in done.stdout and "--backtracking.trace-length" in done.stdout

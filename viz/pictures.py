@@ -1,0 +1,151 @@
+"""Pictures of run folders with matplotlib: coverage over steps, coverage over the maze."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from goalgan_bt import record
+from goalgan_bt.envs.maze import Maze
+
+# Red (never reached) over pale yellow to blue (mastered): readable for colour-blind people.
+COLOURS = "RdYlBu"
+LABELS = {-1: ("too hard", "#a50026"), 0: ("intermediate", "#111111"), 1: ("too easy", "#4575b4")}
+# Goal GAN and Goal GAN + recall traces, Ant U-maze (Goyal et al. 2019): coverage, steps.
+PUBLISHED = {
+    "ant_umaze": [
+        ("Goal GAN (published)", [(2.5e6, 0.20), (45e6, 0.48), (137.5e6, 0.63)]),
+        ("+ recall traces (published)", [(2.5e6, 0.22), (28e6, 0.48), (77.5e6, 0.64)]),
+    ],
+    "point_umaze": [
+        ("Goal GAN (published)", [(0.5e6, 0.20), (3e6, 0.68), (6e6, 0.78)]),
+        ("+ recall traces (published)", [(0.5e6, 0.30), (3e6, 0.78), (4e6, 0.96)]),
+    ],
+}
+
+
+def maze_of(folder: Path) -> Maze | None:
+    """The maze of a run, or None for an environment without walls.
+
+    Raises:
+        RunError: if the folder is no run.
+    """
+    maze = record.read_meta(folder)["maze"]
+    return None if maze is None else Maze(tuple(maze["rows"]), maze["cell_size"])
+
+
+def coverage_curve(ax: Axes, folders: list[Path]) -> None:
+    """Measured coverage over training steps, a line per run, and the published figures.
+
+    Raises:
+        RunError: if a folder is no run.
+    """
+    names = set()
+    for i, folder in enumerate(folders):
+        _, rows = record.read_metrics(folder)
+        points = [
+            (float(row["steps/train"]), float(row["eval/coverage"]))
+            for row in rows
+            if row.get("eval/coverage")
+        ]
+        steps, coverage = zip(*points, strict=True) if points else ((), ())
+        ax.plot(steps, coverage, color=f"C{i}", label=folder.name, marker=".", markersize=4)
+        names.add(folder.name.split("-")[0])
+    for name, style in zip(names, ("--", ":", "-."), strict=False):
+        for (label, points), grey in zip(PUBLISHED.get(name, []), ("0.65", "0.35"), strict=True):
+            steps, coverage = zip(*points, strict=True)
+            ax.plot(steps, coverage, style, color=grey, marker="o", markersize=3, label=label)
+            ax.set_xscale("log")
+    ax.set(xlabel="environment steps of training", ylabel="coverage", ylim=(0, 1))
+    ax.grid(alpha=0.25)
+    ax.legend(fontsize=7, frameon=False, loc="upper left")
+
+
+def coverage_map(ax: Axes, folder: Path, frame: Path, goals: bool = True) -> Any:
+    """One report seen from above: tiles by success, goals by label, recall traces.
+
+    Tiles show the measured coverage, or the learner's own estimate where the report has none.
+
+    Args:
+        ax: where to draw.
+        folder: the run.
+        frame: one of its frames.
+        goals: draw goals and traces too.
+
+    Returns:
+        What `Figure.colorbar` needs.
+
+    Raises:
+        RunError: if the folder is no run or its goals are not places in a maze.
+    """
+    maze = maze_of(folder)
+    if maze is None:
+        raise record.RunError(f"{folder} has no maze to draw: only its curve can be plotted")
+    with np.load(frame, allow_pickle=False) as data:
+        arrays = {name: data[name] for name in data.files}
+    measured = not np.isnan(arrays["coverage"]).all()
+    rate = arrays["coverage"] if measured else arrays["estimate"]
+    tiles = arrays["test_goals"]
+    ax.set_facecolor("#55595f")
+    side = maze.cell_size / np.sqrt(len(tiles) / len(maze.cell_centres()))
+    image = ax.scatter([], [], c=[], cmap=COLOURS, vmin=0, vmax=1)
+    for (x, y), value in zip(tiles, rate, strict=True):
+        colour = image.to_rgba(value)
+        ax.add_patch(Rectangle((x - side / 2, y - side / 2), side, side, color=colour, lw=0))
+    if goals:
+        lines = np.swapaxes(arrays["traces"], 0, 1)
+        ax.add_collection(LineCollection(list(lines), colors="#111111", linewidths=0.5, alpha=0.5))
+        for label, (text, colour) in LABELS.items():
+            chosen = arrays["goals"][arrays["label"] == label]
+            ax.scatter(*chosen.T, s=7, color=colour, label=text, lw=0.3, edgecolors="white")
+    ax.plot(0, 0, marker="*", color="white", markeredgecolor="#111111", markersize=9)
+    ax.set(xlim=(maze.low[0], maze.high[0]), ylim=(maze.low[1], maze.high[1]), aspect="equal")
+    ax.set(xticks=[], yticks=[])
+    kind = "coverage" if measured else "estimate"
+    ax.set_title(f"iteration {int(frame.stem)}: {kind} {np.mean(rate):.2f}", fontsize=9)
+    return image
+
+
+def measured_frames(folder: Path) -> list[Path]:
+    """The frames that hold a measured coverage, oldest first."""
+    chosen = []
+    for frame in record.frames(folder):
+        with np.load(frame, allow_pickle=False) as data:
+            if not np.isnan(data["coverage"]).all():
+                chosen.append(frame)
+    return chosen
+
+
+def overview(folders: list[Path], maps: int = 4) -> Figure:
+    """A row of coverage maps over training per run, and all curves below.
+
+    Args:
+        folders: the runs.
+        maps: how many reports of each run to show, evenly spread.
+
+    Raises:
+        RunError: if a folder is no run or holds no measured report yet.
+    """
+    with_maze = [folder for folder in folders if maze_of(folder) is not None]
+    rows = len(with_maze)
+    figure = Figure(figsize=(2.4 * maps, 2.6 * rows + 3.2), layout="constrained")
+    grid = figure.add_gridspec(rows + 1, maps, height_ratios=[2.6] * rows + [3.2])
+    for r, folder in enumerate(with_maze):
+        frames = measured_frames(folder)
+        if not frames:
+            raise record.RunError(f"{folder} holds no report yet: wait for its first evaluation")
+        picks = np.unique(np.linspace(0, len(frames) - 1, maps).round().astype(int))
+        for c, pick in enumerate(picks):
+            ax = figure.add_subplot(grid[r, c])
+            image = coverage_map(ax, folder, frames[pick])
+            if c == 0:
+                ax.set_ylabel(folder.name, fontsize=7)
+                if r == 0:
+                    ax.legend(fontsize=6, loc="center left", bbox_to_anchor=(0.0, 0.5))
+        figure.colorbar(image, ax=ax, label="success", shrink=0.8)
+    coverage_curve(figure.add_subplot(grid[rows, :]), folders)
+    return figure
