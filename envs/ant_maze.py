@@ -21,6 +21,8 @@ LEG_RADIUS = 0.08  # m
 HEALTHY_Z = (0.3, 1.0)  # m, height of the torso
 # Where each leg leaves the torso; hips turn about z, ankles about the horizontal normal.
 LEGS = 0.2 * np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])  # (4, 2) m
+# A positive ankle angle lowers the feet 1 and 4 and lifts the feet 2 and 3 (half their length).
+ANKLE_LIFT = 0.2 * np.sqrt(2) * np.array([-1.0, 1.0, 1.0, -1.0])  # m
 
 
 def build_model(maze: Maze, integrator: str = "implicitfast") -> mujoco.MjModel:
@@ -68,21 +70,34 @@ class AntMaze(MujocoEnv):
         first = self.model.body("front_left_leg").id  # upper leg (fixed), lower leg, foot
         self._leg_share, self._foot_share = mass[first + 1 : first + 3] / mass.sum()
 
-    def observations(self, states: FloatArray, goals: FloatArray) -> NDArray[np.float32]:
-        offset = goals - self.achieved_goals(states)
-        forward = _rotate(states[:, 3:7], np.array([1.0, 0.0, 0.0]))[:, :2]
-        forward /= np.linalg.norm(forward, axis=1, keepdims=True) + 1e-9
-        left = forward[:, ::-1] * (-1, 1)
-        heading = [(offset * axis).sum(axis=1, keepdims=True) for axis in (forward, left)]
-        return np.concatenate([states, offset, *heading], axis=1, dtype=np.float32)
+    def observations(
+        self, states: FloatArray, goals: FloatArray, achieved: FloatArray | None = None
+    ) -> NDArray[np.float32]:
+        obs = np.empty((len(states), self.obs_dim), dtype=np.float32)
+        offset = goals - (self.achieved_goals(states) if achieved is None else achieved)
+        forward = _rotation(states[:, 3:7])[0][:, :2]
+        forward = forward / (np.linalg.norm(forward, axis=1, keepdims=True) + 1e-9)
+        obs[:, :29] = states
+        obs[:, 29:31] = offset
+        obs[:, 31] = (offset * forward).sum(axis=1)
+        obs[:, 32] = offset[:, 1] * forward[:, 0] - offset[:, 0] * forward[:, 1]
+        return obs
 
     def achieved_goals(self, states: FloatArray) -> FloatArray:
-        """Centre of mass of the whole Ant, (n, 2): what MuJoCo calls the torso's subtree_com."""
-        knees, feet = self._joints(states)
-        # Each leg: a capsule from hip to knee and one from knee to foot; the rest is symmetric.
-        com = self._leg_share * (knees / 2 + LEGS_3D / 2).sum(axis=1)
-        com += self._foot_share * ((knees + feet) / 2).sum(axis=1)
-        return states[:, :2] + _rotate(states[:, 3:7], com)[:, :2]
+        """Centre of mass of the whole Ant, (n, 2): what MuJoCo calls the torso's subtree_com.
+
+        The torso and the upper legs are symmetric. A lower leg d, from hip to knee, has its
+        middle at d / 2, the foot below it at d (1 + cos ankle) plus its height.
+        """
+        hip, ankle = states[:, 7:15:2], states[:, 8:15:2]  # (n, 4) rad
+        weight = self._leg_share / 2 + self._foot_share * (1 + np.cos(ankle))
+        cos, sin = weight * np.cos(hip), weight * np.sin(hip)
+        x = cos @ LEGS[:, 0] - sin @ LEGS[:, 1]
+        y = sin @ LEGS[:, 0] + cos @ LEGS[:, 1]
+        z = self._foot_share * (np.sin(ankle) @ ANKLE_LIFT)
+        along_x, along_y, along_z = _rotation(states[:, 3:7])
+        com = along_x * x[:, None] + along_y * y[:, None] + along_z * z[:, None]
+        return states[:, :2] + com[:, :2]
 
     def place(self, states: FloatArray, goals: FloatArray) -> FloatArray:
         moved = states.copy()
@@ -100,11 +115,7 @@ class AntMaze(MujocoEnv):
         free = self.healthy(states)
         for corner in TORSO_RADIUS * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]):
             free &= self._maze.is_free(states[:, :2] + corner)
-        for joints in self._joints(states):
-            for leg in range(len(LEGS)):
-                tip = states[:, :2] + _rotate(states[:, 3:7], joints[:, leg])[:, :2]
-                free &= self._maze.is_free(tip)
-        return free
+        return np.asarray(free & self._maze.is_free(self._joints(states)).all(axis=1))
 
     def feasible(self, goals: FloatArray) -> BoolArray:
         return self._maze.is_free(goals)
@@ -118,26 +129,22 @@ class AntMaze(MujocoEnv):
         states[:, 3:7] /= np.linalg.norm(states[:, 3:7], axis=1, keepdims=True) + 1e-9
         return states
 
-    def _joints(self, states: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Knees and feet in the torso's frame, each (n, 4, 3), metres."""
-        hip, ankle = states[:, 7:15:2], states[:, 8:15:2]  # (n, 4) rad
-        cos, sin = np.cos(hip), np.sin(hip)
-        x, y = LEGS.T
-        direction = np.stack([cos * x - sin * y, sin * x + cos * y, np.zeros_like(hip)], axis=-1)
-        knees = LEGS_3D + direction
-        lift = ANKLE_SIGN * np.sin(ankle) * np.linalg.norm(LEGS[0])
-        up = np.stack([np.zeros_like(lift), np.zeros_like(lift), lift], axis=-1)
-        feet = knees + 2 * (direction * np.cos(ankle)[..., None] + up)
-        return knees, feet
+    def _joints(self, states: FloatArray) -> FloatArray:
+        """Where knees and feet are on the map, (n, 8, 2), metres."""
+        hip, ankle = states[:, 7:15:2, None], states[:, 8:15:2, None]  # (n, 4, 1) rad
+        leg = np.cos(hip) * LEGS + np.sin(hip) * LEGS[:, ::-1] * (-1, 1)  # (n, 4, 2)
+        flat = np.concatenate([LEGS + leg, LEGS + leg + 2 * np.cos(ankle) * leg], axis=1)
+        lift = 2 * np.sin(ankle[..., 0]) * ANKLE_LIFT
+        height = np.concatenate([np.zeros_like(lift), lift], axis=1)
+        along_x, along_y, along_z = (axis[:, None, :2] for axis in _rotation(states[:, 3:7]))
+        turned = along_x * flat[..., :1] + along_y * flat[..., 1:] + along_z * height[..., None]
+        return states[:, None, :2] + turned
 
 
-LEGS_3D = np.concatenate([LEGS, np.zeros((4, 1))], axis=1)
-# A positive ankle angle lowers the feet 1 and 4 and lifts the feet 2 and 3.
-ANKLE_SIGN = np.array([-1.0, 1.0, 1.0, -1.0])
-
-
-def _rotate(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
-    """Vectors turned by unit quaternions (w, x, y, z): (n, 4), (n, 3) or (3,) -> (n, 3)."""
-    w, u = quaternion[:, :1], quaternion[:, 1:]
-    t = 2 * np.cross(u, np.broadcast_to(vector, u.shape))
-    return vector + w * t + np.cross(u, t)
+def _rotation(quaternion: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Where unit quaternions (w, x, y, z), (n, 4), turn the x, y and z axes, each (n, 3)."""
+    w, x, y, z = quaternion.T
+    along_x = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
+    along_y = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=1)
+    along_z = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    return along_x, along_y, along_z

@@ -19,11 +19,15 @@ Ids = NDArray[np.int64]
 class Step(NamedTuple):
     """What one step of n simulations gave.
 
+    states: (n, state_dim) after the step; obs: (n, obs_dim) float32, those states as the policy
+    sees them.
     rewards: (n,) float32, 1 on reaching the goal, else 0.
     terminated: (n,) bool, the goal was reached or the body failed (an Ant that fell).
     truncated: (n,) bool, the time ran out without either.
     """
 
+    states: FloatArray
+    obs: NDArray[np.float32]
     rewards: NDArray[np.float32]
     terminated: BoolArray
     truncated: BoolArray
@@ -93,8 +97,13 @@ class GoalEnv:
         """Move those simulations by one step under actions in [-1, 1], (n, act_dim)."""
         raise NotImplementedError
 
-    def observations(self, states: FloatArray, goals: FloatArray) -> NDArray[np.float32]:
-        """What the policy sees in those states with those desired goals, (n, obs_dim)."""
+    def observations(
+        self, states: FloatArray, goals: FloatArray, achieved: FloatArray | None = None
+    ) -> NDArray[np.float32]:
+        """What the policy sees in those states with those desired goals, (n, obs_dim).
+
+        `achieved`, (n, goal_dim), saves computing the achieved goals where they are known.
+        """
         raise NotImplementedError
 
     def achieved_goals(self, states: FloatArray) -> FloatArray:
@@ -150,26 +159,25 @@ class GoalEnv:
         """The present observations of some simulations, (n, obs_dim)."""
         return self.observations(self.read_states(ids), self.goals[ids])
 
-    def step(self, ids: Ids, actions: FloatArray) -> tuple[FloatArray, Step]:
+    def step(self, ids: Ids, actions: FloatArray) -> Step:
         """Move some simulations by one step.
 
         Args:
             ids: sorted indices of the simulations, (n,).
             actions: (n, act_dim), clipped to [-1, 1].
-
-        Returns:
-            The states after the step, (n, state_dim), and the outcome.
         """
         self.advance(ids, np.clip(actions, -1.0, 1.0))
         self.elapsed[ids] += 1
         states = self.read_states(ids)
-        healthy = self.healthy(states)
+        healthy, goals = self.healthy(states), self.goals[ids]
         with np.errstate(invalid="ignore"):  # a diverged state is as far as can be
-            distance = np.linalg.norm(self.achieved_goals(states) - self.goals[ids], axis=1)
-            success = healthy & self._feasible[ids] & (distance < self.success_radius)
+            achieved = self.achieved_goals(states)
+            distance = np.square(achieved - goals).sum(axis=1)
+            success = healthy & self._feasible[ids] & (distance < self.success_radius**2)
+            obs = self.observations(states, goals, achieved)
         terminated = success | ~healthy
         truncated = ~terminated & (self.elapsed[ids] >= self.horizon)
-        return states, Step(success.astype(np.float32), terminated, truncated)
+        return Step(states, obs, success.astype(np.float32), terminated, truncated)
 
 
 class MujocoEnv(GoalEnv):
@@ -192,16 +200,18 @@ class MujocoEnv(GoalEnv):
         self.batch = Batch(model, num_envs, threads)
         self._qpos, self._qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._ctrl = self.batch.bind("ctrl")
+        # A state row of MuJoCo is time, qpos, qvel, ...: ours is a slice of it, read in one go.
+        self._row = self.batch.state[:, 1 : 1 + model.nq + model.nv]
+        assert np.shares_memory(self._row[:, : model.nq], self._qpos)
         self.dt = model.opt.timestep
 
     def read_states(self, ids: Ids) -> FloatArray:
-        return np.concatenate([self._qpos[ids], self._qvel[ids]], axis=1)
+        return self._row[ids]
 
     def write_states(self, ids: Ids, states: FloatArray) -> None:
         # A reset also clears the solver's warm start, so that a state has one future only.
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
-        self._qpos[ids] = states[:, : self.model.nq]
-        self._qvel[ids] = states[:, self.model.nq :]
+        self._row[ids] = states
 
     def advance(self, ids: Ids, actions: FloatArray) -> None:
         self._ctrl[ids] = actions

@@ -68,7 +68,9 @@ class PointMaze(MujocoEnv):
         self._qpos[ids], stopped = self._maze.slide(before, self._qpos[ids], RADIUS)
         self._qvel[ids] = np.where(stopped, 0.0, self._qvel[ids])
 
-    def observations(self, states: FloatArray, goals: FloatArray) -> NDArray[np.float32]:
+    def observations(
+        self, states: FloatArray, goals: FloatArray, achieved: FloatArray | None = None
+    ) -> NDArray[np.float32]:
         return np.concatenate([states, goals - states[:, :2]], axis=1, dtype=np.float32)
 
     def achieved_goals(self, states: FloatArray) -> FloatArray:

@@ -48,7 +48,9 @@ class PointND(GoalEnv):
         position = np.clip(position + DT * velocity, -self.bound, self.bound)
         self._states[ids] = np.concatenate([position, velocity], axis=1)
 
-    def observations(self, states: FloatArray, goals: FloatArray) -> NDArray[np.float32]:
+    def observations(
+        self, states: FloatArray, goals: FloatArray, achieved: FloatArray | None = None
+    ) -> NDArray[np.float32]:
         offset = goals - states[:, : self.goal_dim]
         return np.concatenate([states, offset], axis=1, dtype=np.float32)
 

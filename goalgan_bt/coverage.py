@@ -58,10 +58,9 @@ def success_rate(
         env.reset(active, goals[chunk])
         obs = env.observe(active)
         while len(active):
-            states, step = env.step(active, policy.act(obs, noise))
+            step = env.step(active, policy.act(obs, noise))
             steps += len(active)
             reached[begin + active] = step.rewards
             going = ~(step.terminated | step.truncated)
-            active = active[going]
-            obs = env.observations(states[going], env.goals[active])
+            active, obs = active[going], step.obs[going]
     return Success(reached.reshape(len(goals), rollouts).mean(axis=1), steps)

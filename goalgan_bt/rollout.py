@@ -126,13 +126,13 @@ class Collector:
             actions = policy.act(obs, self._noise)
             self._obs[t], self._sampled[t] = obs, actions
             self._actions[env.elapsed, ids] = actions
-            states, step = env.step(ids, actions)
-            self._states[env.elapsed, ids] = states
+            step = env.step(ids, actions)
+            self._states[env.elapsed, ids] = step.states
             self._rewards[t] = step.rewards
             self._terminated[t], self._truncated[t] = step.terminated, step.truncated
 
             done = np.flatnonzero(step.terminated | step.truncated)
-            obs = env.observations(states, env.goals)
+            obs = step.obs
             if len(done):
                 reached = step.rewards[done] > 0
                 lengths = env.elapsed[done]

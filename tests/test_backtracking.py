@@ -102,7 +102,7 @@ def point_experience(env, n=400, steps=100):
         if t % 20 == 0:
             action = rng.uniform(-1, 1, action.shape)
         states.append(env.read_states(ids))
-        after, _ = env.step(ids, action)
+        after = env.step(ids, action).states
         actions.append(action)
         following.append(after)
     return [np.concatenate(x).astype(np.float32) for x in (states, actions, following)]
@@ -125,7 +125,7 @@ def test_traces_lead_to_their_goal_in_the_real_maze():
     for t in range(20):
         valid = traces.valid[t]
         env.reset(ids, np.zeros((n, 2)), np.where(valid[:, None], traces.states[t], traces.seeds))
-        real, _ = env.step(ids, traces.actions[t])
+        real = env.step(ids, traces.actions[t]).states
         if valid.any():
             gap = np.linalg.norm(real - arrives, axis=1)[valid]
             assert np.median(gap) < 0.05

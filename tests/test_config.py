@@ -44,7 +44,9 @@ def test_bad_flags_are_one_clear_line(flags, message):
 
 
 def test_settings_survive_the_run_folder(tmp_path):
-    cfg = config.from_command_line(["--env", "point_umaze", "--policy.hidden", "8", "9", "--out", "x"])
+    cfg = config.from_command_line(
+        ["--env", "point_umaze", "--policy.hidden", "8", "9", "--out", "x"]
+    )
     config.save(cfg, tmp_path)
     assert config.load(tmp_path) == cfg
 

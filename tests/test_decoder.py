@@ -13,7 +13,8 @@ def walked(name):
     env.reset(ids, np.full((100, env.goal_dim), 6.0))
     states = []
     for _ in range(60):
-        after, step = env.step(ids, rng.uniform(-1, 1, (100, env.act_dim)))
+        step = env.step(ids, rng.uniform(-1, 1, (100, env.act_dim)))
+        after = step.states
         states.append(after[~step.terminated])
         env.reset(ids[step.terminated], env.goals[step.terminated])
     return env, np.concatenate(states)

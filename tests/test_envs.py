@@ -21,7 +21,8 @@ def test_every_environment_steps(name):
     ids = everyone(env)
     env.reset(ids, env.test_goals()[-4:])
     for _ in range(5):
-        states, step = env.step(ids, rng.uniform(-1, 1, (4, env.act_dim)))
+        step = env.step(ids, rng.uniform(-1, 1, (4, env.act_dim)))
+        states = step.states
         assert states.shape == (4, env.state_dim)
         assert env.observe(ids).shape == (4, env.obs_dim)
         assert env.observe(ids).dtype == np.float32
@@ -50,7 +51,7 @@ def test_point_nd_sizes(dim):
     assert env.success_radius == pytest.approx(0.3 * np.sqrt(dim / 2))
     env.reset(everyone(env), env.test_goals()[:3])
     for _ in range(300):
-        states, _ = env.step(everyone(env), np.ones((3, dim)))
+        states = env.step(everyone(env), np.ones((3, dim))).states
     assert np.allclose(states[:, :dim], ([1.0, 5.0] + [0.3] * 4)[:dim])
 
 
@@ -89,7 +90,7 @@ def test_a_state_has_one_future(name):
         env.reset(ids, np.zeros((6, env.goal_dim)), states)
         assert np.array_equal(env.read_states(ids), states)
         for _ in range(20):
-            final, _ = env.step(ids, replay.uniform(-1, 1, (6, env.act_dim)))
+            final = env.step(ids, replay.uniform(-1, 1, (6, env.act_dim))).states
         futures.append(final)
     assert np.array_equal(*futures)
 
@@ -119,7 +120,7 @@ def test_threads_do_not_change_the_physics():
         env = envs.make("ant_umaze", 8, threads=threads)
         env.reset(everyone(env), np.zeros((8, 2)))
         for a in actions:
-            states, _ = env.step(everyone(env), a)
+            states = env.step(everyone(env), a).states
         finals.append(states)
     assert np.array_equal(*finals)
 
@@ -134,7 +135,7 @@ def test_batched_physics_is_mujocos(name):
     rng = np.random.default_rng(0)
     for _ in range(40):
         action = rng.uniform(-1, 1, env.act_dim)
-        states, _ = env.step(np.array([0]), action[None])
+        states = env.step(np.array([0]), action[None]).states
         data.ctrl[:] = action
         mujoco.mj_step(env.model, data)
     assert np.array_equal(states[0], np.concatenate([data.qpos, data.qvel]))
@@ -145,7 +146,7 @@ def test_the_ants_achieved_goal_is_mujocos_centre_of_mass():
     rng = np.random.default_rng(0)
     env.reset(everyone(env), np.zeros((32, 2)))
     for _ in range(50):
-        states, _ = env.step(everyone(env), rng.uniform(-1, 1, (32, 8)))
+        states = env.step(everyone(env), rng.uniform(-1, 1, (32, 8))).states
     data = mujoco.MjData(env.model)
     torso = env.model.body("torso").id
     for state, achieved in zip(states, env.achieved_goals(states), strict=True):
@@ -165,7 +166,7 @@ def test_how_far_implicitfast_is_from_rk4():
             rng = np.random.default_rng(0)
             env.reset(everyone(env), np.full((64, 2), 6.0))
             for _ in range(steps):
-                states, _ = env.step(everyone(env), rng.uniform(-1, 1, (64, env.act_dim)))
+                states = env.step(everyone(env), rng.uniform(-1, 1, (64, env.act_dim))).states
             finals.append(env.achieved_goals(states))
         return np.linalg.norm(finals[0] - finals[1], axis=1).mean()
 
@@ -184,12 +185,12 @@ def test_reward_success_and_end():
     start = np.zeros((3, 4))
     start[2, 1] = 0.85
     env.reset(ids, goals, start)
-    _, step = env.step(ids, np.zeros((3, 2)))
+    step = env.step(ids, np.zeros((3, 2)))
     assert step.rewards.tolist() == [1, 0, 0]
     assert step.terminated.tolist() == [True, False, False]
     assert not step.truncated.any()
     for _ in range(env.horizon - 1):
-        _, step = env.step(ids[1:], np.zeros((2, 2)))
+        step = env.step(ids[1:], np.zeros((2, 2)))
     assert step.truncated.all() and not step.terminated.any()
 
 
@@ -201,12 +202,13 @@ def test_an_ant_that_leaves_its_height_fails_without_reward():
     states[2, 2] = 1.2
     states[3, 20] = np.nan
     env.reset(ids, np.zeros((4, 2)), states)
-    _, step = env.step(ids, np.zeros((4, 8)))
+    step = env.step(ids, np.zeros((4, 8)))
     assert step.rewards.tolist() == [1, 0, 0, 0]
     assert step.terminated.all()
     # A diverged simulation recovers at its reset and hurt no other.
     env.reset(np.array([3]), np.full((1, 2), 6.0))
-    states, step = env.step(ids[3:], np.zeros((1, 8)))
+    step = env.step(ids[3:], np.zeros((1, 8)))
+    states = step.states
     assert np.isfinite(states).all() and not step.terminated.any()
 
 
@@ -216,7 +218,7 @@ def test_observation_is_state_and_goal():
     half = np.sqrt(0.5)
     states[1, 3:7] = half, 0, 0, half  # turned left by 90 degrees
     com = env.achieved_goals(states)
-    goals = com + (2.0, 1.0)
+    goals = com + np.array([2.0, 1.0])
     obs = env.observations(states, goals)
     assert np.allclose(obs[:, :29], states, atol=1e-6)
     assert np.allclose(obs[:, 29:31], [2, 1])  # in the world's frame

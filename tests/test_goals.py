@@ -8,7 +8,15 @@ from goalgan_bt.goals import GoalReplay, GoalsConfig, SuccessEstimator, intermed
 
 def test_label_edges_are_strict():
     success = np.array([0.0, 0.1, 0.1001, 0.5, 0.8999, 0.9, 1.0])
-    assert intermediate(success, 0.1, 0.9).tolist() == [False, False, True, True, True, False, False]
+    assert intermediate(success, 0.1, 0.9).tolist() == [
+        False,
+        False,
+        True,
+        True,
+        True,
+        False,
+        False,
+    ]
 
 
 points = st.lists(st.tuples(st.floats(-5, 5), st.floats(-5, 5)), max_size=40)

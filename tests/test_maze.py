@@ -102,6 +102,6 @@ def test_slide_never_enters_a_wall(start, move):
 
 def test_slide_along_a_wall_keeps_the_free_axis():
     before = np.array([[0.0, 0.9]])  # touching the wall above the start cell
-    after, stopped = UMAZE.slide(before, before + (0.5, 0.3), radius=0.1)
+    after, stopped = UMAZE.slide(before, before + np.array([0.5, 0.3]), radius=0.1)
     assert after[0] == pytest.approx([0.5, 0.9])
     assert stopped.tolist() == [[False, True]]

@@ -35,7 +35,8 @@ def test_observations_follow_from_each_other(chain):
     for t, n in np.ndindex(*rollouts.rewards.shape):
         before, goal = rollouts.obs[t, n, :4], rollouts.obs[t, n, :2] + rollouts.obs[t, n, 4:]
         twin.reset(np.array([0]), goal[None].astype(float), before[None].astype(float))
-        states, step = twin.step(np.array([0]), rollouts.actions[t, n][None])
+        step = twin.step(np.array([0]), rollouts.actions[t, n][None])
+        states = step.states
         expected = twin.observations(states, goal[None])[0]
         if rollouts.truncated[t, n]:
             assert next(truncated) == pytest.approx(expected, abs=1e-4)
@@ -88,7 +89,7 @@ def test_episodes_are_complete_and_their_transitions_real():
     twin = envs.make("point_umaze", len(states), threads=1)
     ids = np.arange(len(states))
     twin.reset(ids, np.zeros((len(ids), 2)), states.astype(float))
-    real, _ = twin.step(ids, actions)
+    real = twin.step(ids, actions).states
     assert np.allclose(real, following, atol=1e-4)
 
 
@@ -106,7 +107,7 @@ def test_an_ant_that_fell_is_never_chained():
     env, policy, collector = make("ant_umaze", n=32, steps=150, chain=1.0, horizon=500)
     far = np.array([[4.0, 4.0]])
     collector.begin(far)
-    rollouts, episodes = collector.collect(policy, far)
+    rollouts, _ = collector.collect(policy, far)
     fell = rollouts.terminated & (rollouts.rewards == 0)
     assert fell.any()
     after = np.concatenate([rollouts.obs[1:], rollouts.last_obs[None]])[fell]

@@ -47,7 +47,8 @@ def test_full_force_does_not_press_a_body_into_a_wall(name, radius, speed):
     worst, fastest = -np.inf, 0.0
     for _ in range(STEPS // n):
         actions = np.where(rng.random(actions.shape) < 0.05, -actions, actions)
-        states, step = env.step(ids, actions)
+        step = env.step(ids, actions)
+        states = step.states
         worst = max(worst, depth_in_walls(env.maze, states[:, :2], radius)[~step.terminated].max())
         fastest = max(fastest, np.abs(states[~step.terminated, nq : nq + 2]).max())
         done = step.terminated | step.truncated
