@@ -21,6 +21,7 @@ def make(
     *,
     threads: int = 0,
     horizon: int | None = None,
+    action_repeat: int = 1,
     integrator: str = "implicitfast",
     dim: int = 2,
     map_file: Path | None = None,
@@ -33,6 +34,7 @@ def make(
         threads: simulation threads, 0 for one per core.
         horizon: steps of an episode. If None: 200 for a point and 500 for an Ant in the U-maze,
             and in other mazes more, in proportion to the longest way from the start.
+        action_repeat: steps for which each action is held.
         integrator: `implicitfast` or `rk4`, for MuJoCo bodies.
         dim: dimensions of `point_nd`, 2 to 6.
         map_file: a text map that replaces the layout (see `goalgan_bt.envs.maze`).
@@ -46,13 +48,13 @@ def make(
     if name == "point_nd":
         if not 2 <= dim <= 6:
             raise ValueError(f"point_nd has 2 to 6 dimensions, not {dim}")
-        return PointND(dim, num_envs, horizon or 200)
+        return PointND(dim, num_envs, horizon or 200, action_repeat)
     body, layout = name.split("_")
     constructor, base_horizon = BODIES[body]
     maze = mazes.layout(layout) if map_file is None else mazes.load(map_file)
     if horizon is None:
         scale = maze.longest_path / mazes.layout("umaze").longest_path
         horizon = max(base_horizon, 100 * round(base_horizon * scale / 100))
-    env = constructor(maze, num_envs, horizon, threads, integrator)
+    env = constructor(maze, num_envs, horizon, action_repeat, threads, integrator)
     env.name = name if map_file is None else f"{body}_{map_file.stem}"
     return env

@@ -59,12 +59,13 @@ class AntMaze(MujocoEnv):
         maze: Maze,
         num_envs: int,
         horizon: int,
-        threads: int = 0,
-        integrator: str = "implicitfast",
+        action_repeat: int,
+        threads: int,
+        integrator: str,
     ) -> None:
         self.maze = maze
         self.goal_low, self.goal_high = maze.low, maze.high
-        super().__init__(build_model(maze, integrator), num_envs, horizon, threads)
+        super().__init__(build_model(maze, integrator), num_envs, horizon, action_repeat, threads)
         self._maze = maze
         mass = self.model.body_mass
         first = self.model.body("front_left_leg").id  # upper leg (fixed), lower leg, foot

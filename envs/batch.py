@@ -17,7 +17,7 @@ Ids = NDArray[np.int64]
 
 
 class Step(NamedTuple):
-    """What one step of n simulations gave.
+    """What one action in n simulations gave.
 
     states: (n, state_dim) after the step; obs: (n, obs_dim) float32, those states as the policy
     sees them.
@@ -47,7 +47,9 @@ class GoalEnv:
     Attributes:
         name: for example `ant_umaze`.
         num_envs: N.
-        horizon: steps of an episode; `dt`: seconds of a step.
+        horizon: steps of an episode; dt: seconds of a step.
+        action_repeat: steps for which each action is held. Success, failure and the end of time
+            are checked after each action; all counts are of steps.
         success_radius: metres.
         obs_dim, act_dim, goal_dim, state_dim: sizes of one row.
         start_state: (state_dim,) where episodes begin.
@@ -66,9 +68,10 @@ class GoalEnv:
     goal_high: FloatArray
     maze: Maze | None = None
 
-    def __init__(self, num_envs: int, horizon: int) -> None:
+    def __init__(self, num_envs: int, horizon: int, action_repeat: int) -> None:
         self.num_envs = num_envs
         self.horizon = horizon
+        self.action_repeat = action_repeat
         self.goals = np.zeros((num_envs, self.goal_dim))
         self.elapsed = np.zeros(num_envs, dtype=np.int64)
         self._feasible = np.zeros(num_envs, dtype=bool)
@@ -94,7 +97,7 @@ class GoalEnv:
         raise NotImplementedError
 
     def advance(self, ids: Ids, actions: FloatArray) -> None:
-        """Move those simulations by one step under actions in [-1, 1], (n, act_dim)."""
+        """Hold actions in [-1, 1], (n, act_dim), for `action_repeat` steps."""
         raise NotImplementedError
 
     def observations(
@@ -160,14 +163,14 @@ class GoalEnv:
         return self.observations(self.read_states(ids), self.goals[ids])
 
     def step(self, ids: Ids, actions: FloatArray) -> Step:
-        """Move some simulations by one step.
+        """Take one action, `action_repeat` steps long, in some simulations.
 
         Args:
             ids: sorted indices of the simulations, (n,).
             actions: (n, act_dim), clipped to [-1, 1].
         """
         self.advance(ids, np.clip(actions, -1.0, 1.0))
-        self.elapsed[ids] += 1
+        self.elapsed[ids] += self.action_repeat
         states = self.read_states(ids)
         healthy, goals = self.healthy(states), self.goals[ids]
         with np.errstate(invalid="ignore"):  # a diverged state is as far as can be
@@ -187,13 +190,14 @@ class MujocoEnv(GoalEnv):
         model: the compiled model.
         num_envs: N.
         horizon: steps of an episode.
+        action_repeat: steps for which each action is held.
         threads: simulation threads, 0 for one per core. Results do not depend on it.
     """
 
     def __init__(
-        self, model: mujoco.MjModel, num_envs: int, horizon: int, threads: int = 0
+        self, model: mujoco.MjModel, num_envs: int, horizon: int, action_repeat: int, threads: int
     ) -> None:
-        super().__init__(num_envs, horizon)
+        super().__init__(num_envs, horizon, action_repeat)
         self.model = model
         # A diverged simulation must end its episode, not be put back silently.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -215,7 +219,7 @@ class MujocoEnv(GoalEnv):
 
     def advance(self, ids: Ids, actions: FloatArray) -> None:
         self._ctrl[ids] = actions
-        self.batch.step(ids)
+        self.batch.step(ids, nstep=self.action_repeat)
 
 
 INTEGRATORS = {

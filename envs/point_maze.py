@@ -54,19 +54,22 @@ class PointMaze(MujocoEnv):
         maze: Maze,
         num_envs: int,
         horizon: int,
-        threads: int = 0,
-        integrator: str = "implicitfast",
+        action_repeat: int,
+        threads: int,
+        integrator: str,
     ) -> None:
         self.maze = maze
         self.goal_low, self.goal_high = maze.low, maze.high
-        super().__init__(build_model(maze, integrator), num_envs, horizon, threads)
+        super().__init__(build_model(maze, integrator), num_envs, horizon, action_repeat, threads)
         self._maze = maze
 
     def advance(self, ids: Ids, actions: FloatArray) -> None:
-        before = self._qpos[ids]
-        super().advance(ids, actions)
-        self._qpos[ids], stopped = self._maze.slide(before, self._qpos[ids], RADIUS)
-        self._qvel[ids] = np.where(stopped, 0.0, self._qvel[ids])
+        self._ctrl[ids] = actions
+        for _ in range(self.action_repeat):
+            before = self._qpos[ids]
+            self.batch.step(ids)
+            self._qpos[ids], stopped = self._maze.slide(before, self._qpos[ids], RADIUS)
+            self._qvel[ids] = np.where(stopped, 0.0, self._qvel[ids])
 
     def observations(
         self, states: FloatArray, goals: FloatArray, achieved: FloatArray | None = None

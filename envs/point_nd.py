@@ -27,13 +27,13 @@ class PointND(GoalEnv):
     name = "point_nd"
     dt = DT
 
-    def __init__(self, dim: int, num_envs: int, horizon: int) -> None:
+    def __init__(self, dim: int, num_envs: int, horizon: int, action_repeat: int) -> None:
         self.bound = np.array(([1.0, 5.0] + [0.3] * dim)[:dim])
         self.success_radius = 0.3 * np.sqrt(dim / 2)
         self.act_dim, self.obs_dim = dim, 3 * dim
         self.start_state = np.zeros(2 * dim)
         self.goal_low, self.goal_high = np.full(dim, -GOAL_RANGE), np.full(dim, GOAL_RANGE)
-        super().__init__(num_envs, horizon)
+        super().__init__(num_envs, horizon, action_repeat)
         self._states = np.zeros((num_envs, 2 * dim))
 
     def read_states(self, ids: Ids) -> FloatArray:
@@ -44,8 +44,9 @@ class PointND(GoalEnv):
 
     def advance(self, ids: Ids, actions: FloatArray) -> None:
         position, velocity = np.split(self._states[ids], 2, axis=1)
-        velocity = np.clip(velocity + MAX_FORCE * DT * actions, -MAX_SPEED, MAX_SPEED)
-        position = np.clip(position + DT * velocity, -self.bound, self.bound)
+        for _ in range(self.action_repeat):
+            velocity = np.clip(velocity + MAX_FORCE * DT * actions, -MAX_SPEED, MAX_SPEED)
+            position = np.clip(position + DT * velocity, -self.bound, self.bound)
         self._states[ids] = np.concatenate([position, velocity], axis=1)
 
     def observations(

@@ -27,7 +27,8 @@ class BacktrackingConfig:
     """The backtracking model and its recall traces (Goyal et al. 2019)."""
 
     trace_length: int = 20
-    """Steps of a recall trace (paper: 20 point, 50 ant); 0 is plain Goal GAN."""
+    """Length of a recall trace in environment steps (paper: 20 point, 50 ant); 0 is plain Goal
+    GAN. The model takes one backward step per action, `action_repeat` of them."""
     traces: int = 200
     """Recall traces per iteration, at most."""
     hidden: tuple[int, ...] = (128, 128)

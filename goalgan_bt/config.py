@@ -54,6 +54,8 @@ class Config:
     """Steps of an episode; by default 200 (point) or 500 (ant), more in longer mazes."""
     integrator: Literal["implicitfast", "rk4"] = "implicitfast"
     """MuJoCo's integrator; rk4 is the original's and costs four times as much."""
+    action_repeat: int = 1
+    """Steps of 0.02 s for which the policy holds each action (the original: 1)."""
     threads: int = 0
     """Threads for simulation and for learning; 0 is one per core."""
     discount: float = 0.995
@@ -77,7 +79,7 @@ class Config:
     @property
     def steps_per_iteration(self) -> int:
         """Environment steps of training in one iteration."""
-        return self.updates * self.rollout.num_envs * self.rollout.steps
+        return self.updates * self.rollout.num_envs * self.rollout.steps * self.action_repeat
 
     @property
     def num_threads(self) -> int:
@@ -120,7 +122,8 @@ def check(cfg: Config) -> None:
         ConfigError: naming the first such setting.
     """
     above_zero = (
-        "iterations total_steps minutes horizon updates report_every rollout.num_envs "
+        "iterations total_steps minutes horizon action_repeat updates report_every "
+        "rollout.num_envs "
         "rollout.steps goals.new policy.init_std policy.min_std value.learning_rate value.epochs "
         "value.minibatch gan.learning_rate gan.batch gan.steps gan.noise_dim trpo.max_kl "
         "trpo.cg_iters trpo.fisher_fraction backtracking.batch backtracking.buffer "

@@ -59,7 +59,7 @@ def success_rate(
         obs = env.observe(active)
         while len(active):
             step = env.step(active, policy.act(obs, noise))
-            steps += len(active)
+            steps += len(active) * env.action_repeat
             reached[begin + active] = step.rewards
             going = ~(step.terminated | step.truncated)
             active, obs = active[going], step.obs[going]

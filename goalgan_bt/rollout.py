@@ -1,9 +1,10 @@
-"""Rollouts: what the policy did in N simulations over T steps, and which episodes ended.
+"""Rollouts: what the policy did in N simulations over T actions, and which episodes ended.
 
-Simulations go on from one batch to the next, so that a batch of 100 steps and episodes of 500 fit
+Simulations go on from one batch to the next, so that a batch of 50 actions and episodes of 250 fit
 together.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -26,7 +27,7 @@ class RolloutConfig:
     num_envs: int = 512
     """Simulations side by side."""
     steps: int = 100
-    """Steps of each simulation per policy update; the batch has num_envs * steps."""
+    """Actions in each simulation per policy update; the batch has num_envs * steps of them."""
     chain: float = 0.5
     """Chance that an episode that ended on its feet is followed by one from where it ended, with a
     new goal, instead of one from the start (the original: 0). Only episodes from the start make
@@ -63,7 +64,7 @@ class Episodes:
     """Episodes that ended in a batch, E of them.
 
     goals: (E, goal_dim); success: (E,) whether the goal was reached; from_start: (E,) whether the
-    episode began in the start state; lengths: (E,) steps.
+    episode began in the start state; lengths: (E,) actions.
     Transitions of the successful ones, M in all, in the order in which they happened: states,
     next_states (M, state_dim), actions (M, act_dim) as the body felt them, clipped to [-1, 1].
     """
@@ -98,9 +99,11 @@ class Collector:
         n = env.num_envs
         self._all = np.arange(n)
         self._from_start = np.zeros(n, dtype=bool)
-        # Every unfinished episode, step by step: successes are known only when they end.
-        self._states = np.zeros((env.horizon + 1, n, env.state_dim), dtype=np.float32)
-        self._actions = np.zeros((env.horizon, n, env.act_dim), dtype=np.float32)
+        # Every unfinished episode, action by action: successes are known only when they end.
+        self._age = np.zeros(n, dtype=np.int64)  # actions since the episode began
+        longest = math.ceil(env.horizon / env.action_repeat)
+        self._states = np.zeros((longest + 1, n, env.state_dim), dtype=np.float32)
+        self._actions = np.zeros((longest, n, env.act_dim), dtype=np.float32)
         shape = (cfg.steps, n)
         self._obs = np.zeros((*shape, env.obs_dim), dtype=np.float32)
         self._sampled = np.zeros((*shape, env.act_dim), dtype=np.float32)
@@ -113,7 +116,7 @@ class Collector:
         self._reset(self._all, goals)
 
     def collect(self, policy: GaussianPolicy, goals: FloatArray) -> tuple[Rollouts, Episodes]:
-        """Take `cfg.steps` steps in every simulation; new episodes draw from goals (G, goal_dim).
+        """Take `cfg.steps` actions in every simulation; new episodes draw from goals (G, goal_dim).
 
         The arrays of the rollouts are reused by the next call.
         """
@@ -125,9 +128,10 @@ class Collector:
         for t in range(self.cfg.steps):
             actions = policy.act(obs, self._noise)
             self._obs[t], self._sampled[t] = obs, actions
-            self._actions[env.elapsed, ids] = actions
+            self._actions[self._age, ids] = actions
             step = env.step(ids, actions)
-            self._states[env.elapsed, ids] = step.states
+            self._age += 1
+            self._states[self._age, ids] = step.states
             self._rewards[t] = step.rewards
             self._terminated[t], self._truncated[t] = step.terminated, step.truncated
 
@@ -135,7 +139,7 @@ class Collector:
             obs = step.obs
             if len(done):
                 reached = step.rewards[done] > 0
-                lengths = env.elapsed[done]
+                lengths = self._age[done]
                 ended.append((done, reached, env.goals[done], self._from_start[done], lengths))
                 for i, length in zip(done[reached], lengths[reached], strict=True):
                     successes.append(
@@ -167,10 +171,12 @@ class Collector:
             return
         self.env.reset(ids, self._draw(goals, len(ids)))
         self._from_start[ids] = True
+        self._age[ids] = 0
         self._states[0, ids] = self.env.start_state
 
     def _chain(self, ids: Ids, goals: FloatArray) -> None:
-        self._states[0, ids] = self._states[self.env.elapsed[ids], ids]
+        self._states[0, ids] = self._states[self._age[ids], ids]
+        self._age[ids] = 0
         self.env.set_goals(ids, self._draw(goals, len(ids)))
         self._from_start[ids] = False
 

@@ -7,6 +7,7 @@ Algorithm 1 inside of it (backtracking model, recall traces, imitation).
 """
 
 import errno
+import math
 import signal
 import sys
 import time
@@ -72,7 +73,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
         anywhere = rng.uniform(env.goal_low, env.goal_high, (1000, env.goal_dim))
         collector.begin(anywhere)
         rollouts, _ = collector.collect(policy, anywhere)
-        learner.steps["train"] += rollouts.rewards.size
+        learner.steps["train"] += rollouts.rewards.size * cfg.action_repeat
         policy.normaliser.update(flat(rollouts.obs))
         visited = env.achieved_goals(env.read_states(np.arange(env.num_envs)))
         learner.gan.fit(visited, np.ones(len(visited), dtype=bool), cfg.gan.pretrain_steps)
@@ -92,7 +93,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                 # Rollouts: every simulation goes on where it was.
                 with clock.measure("simulation"):
                     rollouts, episodes = collector.collect(policy, goals)
-                learner.steps["train"] += rollouts.rewards.size
+                learner.steps["train"] += rollouts.rewards.size * cfg.action_repeat
 
                 with clock.measure("learning"):
                     # Policy: a trust-region step on what happened.
@@ -131,7 +132,10 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                     rng,
                 )
                 traces = recall_traces(
-                    learner.backtracking, env, *seeds, cfg.backtracking.trace_length
+                    learner.backtracking,
+                    env,
+                    *seeds,
+                    length=math.ceil(cfg.backtracking.trace_length / cfg.action_repeat),
                 )
                 trace_obs, trace_actions = traces.pairs(env)
                 reference = obs[:: max(1, len(obs) // KL_SAMPLE)]
@@ -261,6 +265,7 @@ def make_env(cfg: Config, num_envs: int) -> GoalEnv:
         num_envs,
         threads=cfg.num_threads,
         horizon=cfg.horizon,
+        action_repeat=cfg.action_repeat,
         integrator=cfg.integrator,
         dim=cfg.dim,
         map_file=cfg.map,

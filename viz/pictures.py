@@ -99,9 +99,9 @@ def coverage_map(ax: Axes, folder: Path, frame: Path, goals: bool = True) -> Any
     if goals:
         lines = np.swapaxes(arrays["traces"], 0, 1)
         ax.add_collection(LineCollection(list(lines), colors="#111111", linewidths=0.5, alpha=0.5))
-        for label, (text, colour) in LABELS.items():
+        for label, (text, shade) in LABELS.items():
             x, y = arrays["goals"][arrays["label"] == label].T
-            ax.scatter(x, y, s=7, color=colour, label=text, lw=0.3, edgecolors="white")
+            ax.scatter(x, y, s=7, color=shade, label=text, lw=0.3, edgecolors="white")
     ax.plot(0, 0, marker="*", color="white", markeredgecolor="#111111", markersize=9)
     ax.set(xlim=(maze.low[0], maze.high[0]), ylim=(maze.low[1], maze.high[1]), aspect="equal")
     ax.set(xticks=[], yticks=[])
