@@ -25,7 +25,7 @@ def test_recalled_actions_become_likelier_and_the_std_stays():
 
 
 def test_the_kl_bound_holds_and_says_so():
-    policy, imitation = make(steps=200, learning_rate=1e-2, max_kl=0.01)
+    policy, imitation = make(steps=200, learning_rate=1e-3, max_kl=0.01)
     obs, reference = torch.randn(300, 4), torch.randn(500, 4)
     mean, log_std = (x.detach().clone() for x in policy(reference))
     stats = imitation.update(obs, torch.ones(300, 2), reference)

@@ -1,0 +1,52 @@
+import subprocess
+import sys
+
+import matplotlib.image
+import pytest
+
+from goalgan_bt import config, record
+from goalgan_bt.envs import maze as mazes
+from goalgan_bt.train import train
+from goalgan_bt.viz import pictures
+
+
+def plot(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "goalgan_bt.plot", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "point_umaze-test-s0"
+    folder.mkdir()
+    flags = "--env point_umaze --iterations 3 --rollout.num-envs 16 --rollout.steps 20 --horizon 30"
+    cfg = config.from_command_line([*flags.split(), "--threads", "1"])
+    record.write_meta(folder, mazes.layout("umaze"))
+    train(cfg, folder)
+    return folder
+
+
+def test_a_run_becomes_a_picture(folder, tmp_path):
+    done = plot(folder, "--out", tmp_path / "c.png")
+    assert done.returncode == 0, done.stderr
+    pixels = matplotlib.image.imread(tmp_path / "c.png")
+    assert min(pixels.shape[:2]) > 400
+    assert len({tuple(p) for p in (pixels[::7, ::7, :3].reshape(-1, 3) * 255).astype(int)}) > 20
+
+
+def test_the_maps_tiles_fill_the_free_cells(folder):
+    figure = pictures.overview([folder], maps=2)
+    ax = figure.axes[0]
+    assert len(ax.patches) == 112
+    assert ax.patches[0].get_width() == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("where", ["nowhere", "."])
+def test_a_folder_that_is_no_run_is_one_line(where, tmp_path):
+    done = plot(tmp_path / where)
+    assert done.returncode == 2
+    assert "is no run" in done.stderr and len(done.stderr.strip().splitlines()) == 1
