@@ -45,13 +45,18 @@ class AntMaze(MujocoEnv):
     """Walk to any point of a maze; success within 1 m.
 
     State: qpos (15: x, y, z in m, torso quaternion w, x, y, z, joint angles in rad) and qvel
-    (14). Observation: the state, the offset from the centre of mass to the desired goal, and the
-    same offset in the torso's heading, 33 numbers. Achieved goal: x, y of the centre of mass.
+    (14). Achieved goal: x, y of the centre of mass.
+
+    The Ant looks the same after a quarter turn with its legs renumbered. The policy sees it, and
+    moves it, in the one of the four equal numberings whose front points most nearly at the goal:
+    what it learns about walking one way holds for all. Observation, 39 numbers: qpos and qvel so
+    numbered, then the offset from the centre of mass to the goal; the front's direction; the
+    offset and the velocity along the front and to its left; and the lean of the torso.
     """
 
     success_radius = 1.0
     act_dim = 8
-    obs_dim = 33
+    obs_dim = 39
     start_state = np.array([0, 0, 0.55, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1] + [0] * 14, float)
 
     def __init__(
@@ -74,15 +79,25 @@ class AntMaze(MujocoEnv):
     def observations(
         self, states: FloatArray, goals: FloatArray, achieved: FloatArray | None = None
     ) -> NDArray[np.float32]:
-        obs = np.empty((len(states), self.obs_dim), dtype=np.float32)
         offset = goals - (self.achieved_goals(states) if achieved is None else achieved)
-        forward = _rotation(states[:, 3:7])[0][:, :2]
-        forward = forward / (np.linalg.norm(forward, axis=1, keepdims=True) + 1e-9)
+        states = renumbered(states, quarter_turns(states, goals))
+        along_x, _, along_z = _rotation(states[:, 3:7])
+        front = along_x[:, :2] / (np.linalg.norm(along_x[:, :2], axis=1, keepdims=True) + 1e-9)
+        velocity = states[:, 15:17]
+        obs = np.empty((len(states), self.obs_dim), dtype=np.float32)
         obs[:, :29] = states
         obs[:, 29:31] = offset
-        obs[:, 31] = (offset * forward).sum(axis=1)
-        obs[:, 32] = offset[:, 1] * forward[:, 0] - offset[:, 0] * forward[:, 1]
+        obs[:, 31:33] = front
+        obs[:, 33], obs[:, 34] = _ahead_and_left(offset, front)
+        obs[:, 35], obs[:, 36] = _ahead_and_left(velocity, front)
+        obs[:, 37], obs[:, 38] = _ahead_and_left(along_z[:, :2], front)
         return obs
+
+    def to_body(self, actions: FloatArray, states: FloatArray, goals: FloatArray) -> FloatArray:
+        return _renumber_actions(actions, -quarter_turns(states, goals))
+
+    def from_body(self, actions: FloatArray, states: FloatArray, goals: FloatArray) -> FloatArray:
+        return _renumber_actions(actions, quarter_turns(states, goals))
 
     def achieved_goals(self, states: FloatArray) -> FloatArray:
         """Centre of mass of the whole Ant, (n, 2): what MuJoCo calls the torso's subtree_com.
@@ -140,6 +155,65 @@ class AntMaze(MujocoEnv):
         along_x, along_y, along_z = (axis[:, None, :2] for axis in _rotation(states[:, 3:7]))
         turned = along_x * flat[..., :1] + along_y * flat[..., 1:] + along_z * height[..., None]
         return states[:, None, :2] + turned
+
+
+def quarter_turns(states: FloatArray, goals: FloatArray) -> NDArray[np.int64]:
+    """By how many quarter turns to the left each Ant's front is off its goal, (n,), 0 to 3."""
+    offset, (along_x, _, _) = goals - states[:, :2], _rotation(states[:, 3:7])
+    ahead, left = _ahead_and_left(offset, along_x[:, :2])
+    turns = np.where(np.abs(ahead) >= np.abs(left), 1 - np.sign(ahead), 2 - np.sign(left))
+    return turns.astype(np.int64)
+
+
+def renumbered(states: FloatArray, turns: NDArray[np.int64]) -> FloatArray:
+    """The same physical states with the front turned left and the legs renumbered, (n, 29).
+
+    Args:
+        states: (n, 29).
+        turns: (n,) quarter turns.
+    """
+    angle = turns * np.pi / 2
+    cos, sin = np.cos(angle), np.sin(angle)
+    out = states.copy()
+    half_cos, half_sin = np.cos(angle / 2), np.sin(angle / 2)
+    w, x, y, z = states[:, 3:7].T
+    out[:, 3] = w * half_cos - z * half_sin  # the quaternion times a turn about z
+    out[:, 4] = x * half_cos + y * half_sin
+    out[:, 5] = y * half_cos - x * half_sin
+    out[:, 6] = z * half_cos + w * half_sin
+    out[:, 3:7] *= np.where(out[:, 3:4] < 0, -1.0, 1.0)  # q and -q are the same rotation
+    out[:, 18] = cos * states[:, 18] + sin * states[:, 19]  # spin is told in the torso's frame
+    out[:, 19] = cos * states[:, 19] - sin * states[:, 18]
+    leg, sign = _leg_order(turns)
+    for joints in (slice(7, 15), slice(21, 29)):
+        hips, ankles = states[:, joints][:, 0::2], states[:, joints][:, 1::2]
+        out[:, joints][:, 0::2] = np.take_along_axis(hips, leg, axis=1)
+        out[:, joints][:, 1::2] = np.take_along_axis(ankles, leg, axis=1) * sign
+    return out
+
+
+def _renumber_actions(actions: FloatArray, turns: NDArray[np.int64]) -> FloatArray:
+    """Torques for legs renumbered as in `renumbered`; the motors begin with leg 4, (n, 8)."""
+    leg, sign = _leg_order(turns)
+    by_leg = np.roll(actions, -2, axis=1)
+    out = np.empty_like(by_leg)
+    out[:, 0::2] = np.take_along_axis(by_leg[:, 0::2], leg, axis=1)
+    out[:, 1::2] = np.take_along_axis(by_leg[:, 1::2], leg, axis=1) * sign
+    return np.roll(out, 2, axis=1)
+
+
+def _leg_order(turns: NDArray[np.int64]) -> tuple[NDArray[np.int64], FloatArray]:
+    """Which leg takes each leg's place, (n, 4), and the sign of its ankle there, (n, 4)."""
+    leg = (np.arange(4) + turns[:, None]) % 4
+    lift = np.sign(ANKLE_LIFT)
+    return leg, lift * lift[leg]
+
+
+def _ahead_and_left(vector: FloatArray, front: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Components of vectors (n, 2) along fronts (n, 2) and to their left, each (n,)."""
+    ahead = vector[:, 0] * front[:, 0] + vector[:, 1] * front[:, 1]
+    left = vector[:, 1] * front[:, 0] - vector[:, 0] * front[:, 1]
+    return ahead, left
 
 
 def _rotation(quaternion: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

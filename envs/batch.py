@@ -19,8 +19,9 @@ Ids = NDArray[np.int64]
 class Step(NamedTuple):
     """What one action in n simulations gave.
 
-    states: (n, state_dim) after the step; obs: (n, obs_dim) float32, those states as the policy
-    sees them.
+    states: (n, state_dim) afterwards; obs: (n, obs_dim) float32, those states as the policy sees
+    them.
+    actions: (n, act_dim) what the body felt, in [-1, 1] (see `GoalEnv.to_body`).
     rewards: (n,) float32, 1 on reaching the goal, else 0.
     terminated: (n,) bool, the goal was reached or the body failed (an Ant that fell).
     truncated: (n,) bool, the time ran out without either.
@@ -28,6 +29,7 @@ class Step(NamedTuple):
 
     states: FloatArray
     obs: NDArray[np.float32]
+    actions: FloatArray
     rewards: NDArray[np.float32]
     terminated: BoolArray
     truncated: BoolArray
@@ -133,6 +135,17 @@ class GoalEnv:
         """The feasible goals over which coverage is measured, (K, goal_dim)."""
         raise NotImplementedError
 
+    def to_body(self, actions: FloatArray, states: FloatArray, goals: FloatArray) -> FloatArray:
+        """What a policy's actions, given its observation, mean for the body, (n, act_dim).
+
+        They differ where the observation is told in a frame of its own, as the Ant's is.
+        """
+        return actions
+
+    def from_body(self, actions: FloatArray, states: FloatArray, goals: FloatArray) -> FloatArray:
+        """The inverse of `to_body`: how a policy would have to say what the body did."""
+        return actions
+
     def repair(self, states: FloatArray) -> FloatArray:
         """States with the constraints that a learned model breaks put right, (n, state_dim)."""
         return states
@@ -169,10 +182,12 @@ class GoalEnv:
             ids: sorted indices of the simulations, (n,).
             actions: (n, act_dim), clipped to [-1, 1].
         """
-        self.advance(ids, np.clip(actions, -1.0, 1.0))
+        goals = self.goals[ids]
+        actions = self.to_body(np.clip(actions, -1.0, 1.0), self.read_states(ids), goals)
+        self.advance(ids, actions)
         self.elapsed[ids] += self.action_repeat
         states = self.read_states(ids)
-        healthy, goals = self.healthy(states), self.goals[ids]
+        healthy = self.healthy(states)
         with np.errstate(invalid="ignore"):  # a diverged state is as far as can be
             achieved = self.achieved_goals(states)
             distance = np.square(achieved - goals).sum(axis=1)
@@ -180,7 +195,7 @@ class GoalEnv:
             obs = self.observations(states, goals, achieved)
         terminated = success | ~healthy
         truncated = ~terminated & (self.elapsed[ids] >= self.horizon)
-        return Step(states, obs, success.astype(np.float32), terminated, truncated)
+        return Step(states, obs, actions, success.astype(np.float32), terminated, truncated)
 
 
 class MujocoEnv(GoalEnv):

@@ -101,10 +101,11 @@ class RecallTraces(NamedTuple):
 
     def pairs(self, env: GoalEnv) -> tuple[Tensor, Tensor]:
         """What imitation needs of the valid steps: observations with the goal that seeded the
-        trace, (m, obs_dim), and actions, (m, act_dim)."""
+        trace, (m, obs_dim), and the actions that a policy would have to take, (m, act_dim)."""
         goals = np.broadcast_to(self.goals, (*self.valid.shape, env.goal_dim))[self.valid]
-        obs = env.observations(self.states[self.valid], goals)
-        return torch.from_numpy(obs), torch.from_numpy(self.actions[self.valid]).float()
+        states = self.states[self.valid]
+        actions = env.from_body(self.actions[self.valid], states, goals)
+        return torch.from_numpy(env.observations(states, goals)), torch.from_numpy(actions).float()
 
     def paths(self, env: GoalEnv) -> Float32:
         """Achieved goals along each trace, (L, n, goal_dim), NaN after it stopped."""

@@ -37,7 +37,7 @@ class Learner:
         self.policy = GaussianPolicy(env.obs_dim, env.act_dim, cfg.policy)
         self.value = ValueFunction(env.obs_dim, cfg.value)
         self.gan = GoalGAN(*box, cfg.gan, self.noise)
-        self.estimator = SuccessEstimator(*box, cfg.goals, self.noise)
+        self.estimator = SuccessEstimator(env.goal_dim, cfg.goals)
         self.replay = GoalReplay(env.goal_dim, cfg.goals.replay_distance)
         self.backtracking = BacktrackingModel(
             env.state_dim, env.act_dim, cfg.backtracking, self.noise
@@ -55,8 +55,6 @@ class Learner:
             "generator_optimiser": self.gan.generator_optimiser,
             "discriminator": self.gan.discriminator,
             "discriminator_optimiser": self.gan.discriminator_optimiser,
-            "estimator": self.estimator.net,
-            "estimator_optimiser": self.estimator.optimiser,
             "backtracking": self.backtracking,
             "backtracking_optimiser": self.backtracking.optimiser,
             "imitation_optimiser": self.imitation.optimiser,

@@ -66,7 +66,7 @@ class Episodes:
     goals: (E, goal_dim); success: (E,) whether the goal was reached; from_start: (E,) whether the
     episode began in the start state; lengths: (E,) actions.
     Transitions of the successful ones, M in all, in the order in which they happened: states,
-    next_states (M, state_dim), actions (M, act_dim) as the body felt them, clipped to [-1, 1].
+    next_states (M, state_dim), actions (M, act_dim) as the body felt them.
     """
 
     goals: FloatArray
@@ -128,8 +128,8 @@ class Collector:
         for t in range(self.cfg.steps):
             actions = policy.act(obs, self._noise)
             self._obs[t], self._sampled[t] = obs, actions
-            self._actions[self._age, ids] = actions
             step = env.step(ids, actions)
+            self._actions[self._age, ids] = step.actions
             self._age += 1
             self._states[self._age, ids] = step.states
             self._rewards[t] = step.rewards
@@ -194,8 +194,6 @@ class Collector:
             from_start.astype(bool),
             lengths.astype(np.int64),
             np.concatenate([no_states, *(s[:-1] for s, _ in successes)]),
-            np.concatenate(
-                [np.empty((0, env.act_dim), np.float32), *(a for _, a in successes)]
-            ).clip(-1.0, 1.0),
+            np.concatenate([np.empty((0, env.act_dim), np.float32), *(a for _, a in successes)]),
             np.concatenate([no_states, *(s[1:] for s, _ in successes)]),
         )

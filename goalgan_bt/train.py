@@ -103,7 +103,6 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                     # What the episodes tell: how hard each goal is, what preceded success.
                     first = episodes.from_start
                     learner.estimator.add(episodes.goals[first], episodes.success[first])
-                    metrics |= group("estimator", learner.estimator.fit())
                     learner.transitions.add(episodes.states, episodes.actions, episodes.next_states)
                     if cfg.backtracking.trace_length:
                         losses = learner.backtracking.fit(learner.transitions)

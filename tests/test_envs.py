@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from goalgan_bt import envs
+from goalgan_bt.envs import ant_maze
 from goalgan_bt.envs.maze import MapError
 
 ALL = ["point_umaze", "ant_umaze", "point_nd"]
@@ -212,18 +213,74 @@ def test_an_ant_that_leaves_its_height_fails_without_reward():
     assert np.isfinite(states).all() and not step.terminated.any()
 
 
-def test_observation_is_state_and_goal():
+def ant_states(n=24):
+    """Varied states of an Ant that walked at random, turned to all sides."""
+    env = envs.make("ant_umaze", n, threads=1)
+    rng = np.random.default_rng(0)
+    ids, yaw = everyone(env), rng.uniform(-np.pi, np.pi, n)
+    start = np.tile(env.start_state, (n, 1))
+    start[:, 3], start[:, 6] = np.cos(yaw / 2), np.sin(yaw / 2)
+    env.reset(ids, np.full((n, 2), 6.0), start)
+    for _ in range(15):
+        states = env.step(ids, rng.uniform(-0.5, 0.5, (n, 8))).states
+    return env, states, rng.uniform(env.goal_low, env.goal_high, (n, 2))
+
+
+def test_renumbering_the_ants_legs_changes_nothing_physical():
+    """Stepping renumbered states under renumbered torques is renumbering the stepped states."""
+    env, states, _ = ant_states()
+    ids, n = everyone(env), len(states)
+    states[:, :2] = 0.0  # away from walls
+    actions = np.random.default_rng(1).uniform(-1, 1, (n, 8))
+    env.write_states(ids, states)
+    env.advance(ids, actions)
+    after = env.read_states(ids)
+    for k in range(4):
+        turns = np.full(n, k)
+        assert np.allclose(
+            env.achieved_goals(ant_maze.renumbered(states, turns)), env.achieved_goals(states)
+        )
+        env.write_states(ids, ant_maze.renumbered(states, turns))
+        env.advance(ids, ant_maze._renumber_actions(actions, turns))
+        same = ant_maze.renumbered(after, turns)
+        mine = ant_maze.renumbered(env.read_states(ids), np.zeros(n, dtype=int))
+        assert np.allclose(mine, same, atol=1e-9)
+
+
+def test_the_front_points_at_the_goal():
+    env, states, goals = ant_states()
+    turned = ant_maze.renumbered(states, ant_maze.quarter_turns(states, goals))
+    assert (ant_maze.quarter_turns(turned, goals) == 0).all()
+    ahead, left = env.observations(states, goals)[:, 33:35].T
+    assert (ahead > 0).all() and (np.abs(left) < ahead + 0.2).all()  # of the centre of mass
+
+
+def test_actions_go_to_the_body_and_back():
+    env, states, goals = ant_states()
+    actions = np.random.default_rng(1).uniform(-1, 1, (len(states), 8))
+    there = env.to_body(actions, states, goals)
+    assert not np.allclose(there, actions)
+    assert np.allclose(env.from_body(there, states, goals), actions)
+    env.reset(everyone(env), goals, states)
+    step = env.step(everyone(env), actions)
+    assert np.allclose(step.actions, there)
+
+
+def test_the_ants_observation_holds_state_and_goal():
     env = envs.make("ant_umaze", 1)
     states = np.tile(env.start_state, (2, 1))
     half = np.sqrt(0.5)
-    states[1, 3:7] = half, 0, 0, half  # turned left by 90 degrees
-    com = env.achieved_goals(states)
-    goals = com + np.array([2.0, 1.0])
-    obs = env.observations(states, goals)
-    assert np.allclose(obs[:, :29], states, atol=1e-6)
-    assert np.allclose(obs[:, 29:31], [2, 1])  # in the world's frame
-    assert np.allclose(obs[0, 31:33], [2, 1], atol=1e-6)  # ahead and to the left
-    assert np.allclose(obs[1, 31:33], [1, -2], atol=1e-6)
+    states[1, 3:7] = half, 0, 0, half  # turned left by a quarter
+    states[:, 15:17] = 0.5, 0.1
+    offset = np.array([2.0, 1.0])
+    obs = env.observations(states, env.achieved_goals(states) + offset)
+    assert np.allclose(obs[0, :29], states[0], atol=1e-6)  # its front points at the goal already
+    assert np.allclose(obs[1, :7], states[0, :7], atol=1e-6)  # renumbered, it is the same Ant
+    assert np.allclose(obs[:, 29:31], offset)
+    assert np.allclose(obs[:, 31:33], [1, 0], atol=1e-6)
+    assert np.allclose(obs[:, 33:35], [2, 1], atol=1e-6)
+    assert np.allclose(obs[:, 35:37], [0.5, 0.1], atol=1e-6)
+    assert np.allclose(obs[:, 37:39], 0, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ALL)
