@@ -51,7 +51,9 @@ class AntMaze(MujocoEnv):
     moves it, in the one of the four equal numberings whose front points most nearly at the goal:
     what it learns about walking one way holds for all. Observation, 39 numbers: qpos and qvel so
     numbered, then the offset from the centre of mass to the goal; the front's direction; the
-    offset and the velocity along the front and to its left; and the lean of the torso.
+    offset and the velocity along the front and to its left; and the lean of the torso. The offset
+    d is told as d / (1 m + |d|): a goal that is far looks like one that is less far in the same
+    direction, so that the Ant already walks towards goals which it has never reached.
     """
 
     success_radius = 1.0
@@ -80,6 +82,7 @@ class AntMaze(MujocoEnv):
         self, states: FloatArray, goals: FloatArray, achieved: FloatArray | None = None
     ) -> NDArray[np.float32]:
         offset = goals - (self.achieved_goals(states) if achieved is None else achieved)
+        offset /= 1.0 + np.linalg.norm(offset, axis=1, keepdims=True)
         states = renumbered(states, quarter_turns(states, goals))
         along_x, _, along_z = _rotation(states[:, 3:7])
         front = along_x[:, :2] / (np.linalg.norm(along_x[:, :2], axis=1, keepdims=True) + 1e-9)

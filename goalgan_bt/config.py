@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import math
 import os
 import sys
 import types
@@ -59,7 +60,7 @@ class Config:
     threads: int = 0
     """Threads for simulation and for learning; 0 is one per core."""
     discount: float = 0.995
-    """Discount factor per step (the original: 0.99)."""
+    """Discount factor per action (the original: 0.99)."""
     gae_lambda: float = 0.95
     """Lambda of generalised advantage estimation (the original: 1)."""
     updates: int = 1
@@ -90,7 +91,13 @@ class Config:
 ANT = Config(
     env="ant_umaze",
     total_steps=12_000_000,
+    action_repeat=2,
+    discount=0.993,
+    updates=2,
+    policy=PolicyConfig(init_std=0.25, final_std=0.1),
+    rollout=RolloutConfig(num_envs=256, steps=50),
     backtracking=BacktrackingConfig(trace_length=50),
+    imitation=ImitationConfig(steps=5, learning_rate=3e-5, max_kl=0.002),
 )
 POINT = Config(
     env="point_umaze",
@@ -112,7 +119,10 @@ def preset(env: str) -> Config:
     """
     if env not in envs.NAMES:
         raise ConfigError(f"unknown environment {env!r}: choose one of {', '.join(envs.NAMES)}")
-    return replace(ANT if env.startswith("ant") else POINT, env=env)
+    cfg = replace(ANT if env.startswith("ant") else POINT, env=env)
+    if env == "point_nd":  # no walls to be misled by, and too large a space to have been everywhere
+        cfg = replace(cfg, goals=replace(cfg.goals, near=math.inf))
+    return cfg
 
 
 def check(cfg: Config) -> None:
@@ -128,10 +138,11 @@ def check(cfg: Config) -> None:
         "value.minibatch gan.learning_rate gan.batch gan.steps gan.noise_dim trpo.max_kl "
         "trpo.cg_iters trpo.fisher_fraction backtracking.batch backtracking.buffer "
         "backtracking.learning_rate imitation.batch imitation.learning_rate imitation.max_kl "
-        "coverage.rollouts coverage.every"
+        "coverage.rollouts coverage.every goals.near"
     )
     not_negative = (
-        "seed threads goals.old goals.replay_distance goals.label_rollouts gan.goal_noise "
+        "seed threads goals.old goals.labelled goals.replay_distance goals.label_rollouts "
+        "gan.goal_noise "
         "gan.pretrain_steps backtracking.trace_length backtracking.steps backtracking.traces "
         "imitation.steps trpo.cg_damping trpo.line_search_steps"
     )

@@ -32,14 +32,14 @@ class GanConfig:
     """Step size of RMSProp (decay 0.9), both networks."""
     batch: int = 64
     """Real goals, and as many generated ones, per step."""
-    steps: int = 100
+    steps: int = 200
     """Training steps per iteration (the original: 250 to 300)."""
     pretrain_steps: int = 300
     """Training steps on what the fresh policy visits."""
     generator_target: float = 1.0
     """c, what the generator wants D to say: 1 in the original code, 0 in the paper."""
-    goal_noise: float = 0.5
-    """Standard deviation of the noise added to generated goals, metres."""
+    goal_noise: float = 0.3
+    """Standard deviation of the noise added to generated goals, metres (the original: 0.5)."""
 
 
 class GoalGAN:

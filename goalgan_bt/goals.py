@@ -25,8 +25,13 @@ class GoalsConfig:
     """Goals from the GAN per iteration."""
     old: int = 100
     """Goals from the replay per iteration."""
+    labelled: int = 1000
+    """Further goals, uniform in the box, that the success estimator labels for the GAN."""
     replay_distance: float = 0.3
     """Replayed goals keep this distance from each other, metres."""
+    near: float = 0.4
+    """A goal farther than this from all places where the agent has been is too hard, metres (the
+    original: inf). Without it, walls around mastered places look intermediate."""
     label_rollouts: int = 0
     """Fresh episodes per goal for its label (the original: 3); 0 takes labels from training."""
     episodes: int = 1000
@@ -46,10 +51,11 @@ def intermediate(success: FloatArray, r_min: float, r_max: float) -> BoolArray:
     return (success > r_min) & (success < r_max)
 
 
-class GoalReplay:
-    """Goals that once were of intermediate difficulty, each at some distance from all others.
+class GoalMemory:
+    """Goals, each at some distance from all others.
 
-    Replaying them keeps the policy from forgetting (Florensa et al. 2018, section 4.3).
+    One holds the goals that once were of intermediate difficulty: replaying them keeps the policy
+    from forgetting (Florensa et al. 2018, section 4.3). Another holds where the agent has been.
     """
 
     def __init__(self, goal_dim: int, distance: float) -> None:
@@ -64,6 +70,12 @@ class GoalReplay:
         for goal in goals:
             if (np.linalg.norm(self.goals - goal, axis=1) > self.distance).all():
                 self.goals = np.append(self.goals, goal[None], axis=0)
+
+    def distance_to(self, goals: FloatArray) -> FloatArray:
+        """From each goal (n, goal_dim) to the nearest one kept, (n,); infinite if none is."""
+        if len(self.goals) == 0:
+            return np.full(len(goals), np.inf)
+        return np.asarray(np.linalg.norm(goals[:, None] - self.goals, axis=2).min(axis=1))
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """At most n different goals, (<= n, goal_dim)."""

@@ -9,8 +9,9 @@ import torch
 from goalgan_bt.backtracking import BacktrackingModel, Transitions
 from goalgan_bt.config import Config
 from goalgan_bt.envs.batch import GoalEnv
+from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.gan import GoalGAN
-from goalgan_bt.goals import GoalReplay, SuccessEstimator
+from goalgan_bt.goals import GoalMemory, SuccessEstimator, intermediate
 from goalgan_bt.imitation import Imitation
 from goalgan_bt.policy import GaussianPolicy, ValueFunction
 
@@ -22,11 +23,13 @@ class Learner:
         iteration: finished iterations; steps: environment steps by purpose (`train`, `label`,
             `eval`); seconds: wall time so far.
         rng: numpy's generator; noise: torch's.
-        policy, value, gan, estimator, replay, backtracking, transitions, imitation: the parts.
+        policy, value, gan, estimator, replay, visited, backtracking, transitions, imitation: the
+            parts.
     """
 
     def __init__(self, env: GoalEnv, cfg: Config) -> None:
         torch.manual_seed(cfg.seed)  # first weights
+        self.cfg = cfg.goals
         self.iteration = 0
         self.steps = {"train": 0, "label": 0, "eval": 0}
         self.seconds = 0.0
@@ -38,12 +41,22 @@ class Learner:
         self.value = ValueFunction(env.obs_dim, cfg.value)
         self.gan = GoalGAN(*box, cfg.gan, self.noise)
         self.estimator = SuccessEstimator(env.goal_dim, cfg.goals)
-        self.replay = GoalReplay(env.goal_dim, cfg.goals.replay_distance)
+        self.replay = GoalMemory(env.goal_dim, cfg.goals.replay_distance)
+        self.visited = GoalMemory(env.goal_dim, cfg.goals.near / 2)
         self.backtracking = BacktrackingModel(
             env.state_dim, env.act_dim, cfg.backtracking, self.noise
         )
         self.transitions = Transitions(env.state_dim, env.act_dim, cfg.backtracking)
         self.imitation = Imitation(self.policy, cfg.imitation, self.noise)
+
+    def intermediate(self, goals: FloatArray, success: FloatArray) -> BoolArray:
+        """Labels of goals (n, goal_dim) with that success (n,): intermediate difficulty, (n,).
+
+        Besides the bounds on success, a goal must be near a place where the agent has been: the
+        estimator averages over neighbours, and beside a mastered place there may be a wall.
+        """
+        near = self.visited.distance_to(goals) <= self.cfg.near
+        return intermediate(success, self.cfg.r_min, self.cfg.r_max) & near
 
     def _modules(self) -> dict[str, Any]:
         """Everything with torch's `state_dict` and `load_state_dict`: networks, optimisers."""
@@ -72,6 +85,7 @@ class Learner:
             "rng": repr(self.rng.bit_generator.state),  # integers too long for a tensor
             "noise": self.noise.get_state(),
             "replay": torch.from_numpy(self.replay.goals),
+            "visited": torch.from_numpy(self.visited.goals),
             "estimator_goals": torch.from_numpy(self.estimator.goals),
             "estimator_success": torch.from_numpy(self.estimator.success),
             "transitions": {
@@ -98,6 +112,7 @@ class Learner:
         self.rng.bit_generator.state = ast.literal_eval(state["rng"])
         self.noise.set_state(state["noise"])
         self.replay.goals = state["replay"].numpy().copy()
+        self.visited.goals = state["visited"].numpy().copy()
         self.estimator.goals = state["estimator_goals"].numpy().copy()
         self.estimator.success = state["estimator_success"].numpy().copy()
         saved, rows = state["transitions"], self.transitions

@@ -22,8 +22,10 @@ class PolicyConfig:
     """Units of the hidden layers (the original: 64 64)."""
     init_std: float = 0.6
     """First standard deviation of the actions, in units of the action range [-1, 1]."""
-    min_std: float = 0.1
+    min_std: float = 0.05
     """The standard deviation never falls below this."""
+    final_std: float | None = None
+    """If given, the standard deviation is kept below a line from init_std to this over the run."""
 
 
 @dataclass(frozen=True)
@@ -113,11 +115,18 @@ class GaussianPolicy(nn.Module):
         self.normaliser = Normaliser(obs_dim)
         self.net = MeanNetwork((obs_dim, *cfg.hidden, act_dim))
         self.log_std = nn.Parameter(torch.full((act_dim,), math.log(cfg.init_std)))
-        self._min_log_std = math.log(cfg.min_std)
+        self.cfg = cfg
+        self.cap_std(0.0)
+
+    def cap_std(self, progress: float) -> None:
+        """Lower the bound on the standard deviation; progress in the run, 0 to 1."""
+        first, last = self.cfg.init_std, self.cfg.final_std
+        self._max_std = math.inf if last is None else first + min(progress, 1.0) * (last - first)
 
     def forward(self, normalised: Tensor) -> tuple[Tensor, Tensor]:
         """Mean (n, act_dim) and log standard deviation (act_dim,) at normalised observations."""
-        return self.net(normalised), self.log_std.clamp(min=self._min_log_std)
+        log_std = self.log_std.clamp(math.log(self.cfg.min_std), math.log(self._max_std))
+        return self.net(normalised), log_std
 
     @torch.inference_mode()
     def act(

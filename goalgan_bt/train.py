@@ -29,7 +29,6 @@ from goalgan_bt.coverage import success_rate
 from goalgan_bt.decoder import decode
 from goalgan_bt.envs.batch import GoalEnv
 from goalgan_bt.envs.maze import MapError
-from goalgan_bt.goals import intermediate
 from goalgan_bt.learner import Learner
 from goalgan_bt.progress import Progress, complain, say
 from goalgan_bt.record import Record
@@ -67,6 +66,8 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
     records = Record(folder, learner.iteration)
     clock = Clock(learner.seconds)
     coverage = float("nan")
+    everyone = np.arange(env.num_envs)
+    extra = 0 if cfg.goals.label_rollouts else cfg.goals.labelled
 
     # Before any curriculum exists, goals are wherever a fresh policy happens to wander.
     if learner.iteration == 0:
@@ -75,7 +76,8 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
         rollouts, _ = collector.collect(policy, anywhere)
         learner.steps["train"] += rollouts.rewards.size * cfg.action_repeat
         policy.normaliser.update(flat(rollouts.obs))
-        visited = env.achieved_goals(env.read_states(np.arange(env.num_envs)))
+        visited = env.achieved_goals(env.read_states(everyone))
+        learner.visited.add(visited)
         learner.gan.fit(visited, np.ones(len(visited), dtype=bool), cfg.gan.pretrain_steps)
     collector.begin(learner.gan.sample(cfg.goals.new))
 
@@ -84,6 +86,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
         while not last:
             learner.iteration += 1
             metrics: dict[str, float] = {"iteration": learner.iteration}
+            policy.cap_std(finished(cfg, learner, clock.total()))
 
             # Goals: most imagined by the generator, some remembered so that old skills stay.
             imagined = learner.gan.sample(cfg.goals.new)
@@ -118,9 +121,16 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
             else:
                 success = learner.estimator(goals)
             with clock.measure("learning"):
-                labels = intermediate(success, cfg.goals.r_min, cfg.goals.r_max)
-                metrics |= group("gan", learner.gan.fit(goals, labels))
+                learner.visited.add(env.achieved_goals(env.read_states(everyone)))
+                labels = learner.intermediate(goals, success)
                 learner.replay.add(goals[labels])
+                # The estimator's labels are free: the GAN also learns from goals that nobody tried.
+                others = rng.uniform(env.goal_low, env.goal_high, (extra, env.goal_dim))
+                other_labels = learner.intermediate(others, learner.estimator(others))
+                losses = learner.gan.fit(
+                    np.concatenate([goals, others]), np.concatenate([labels, other_labels])
+                )
+                metrics |= group("gan", losses)
 
                 # Recall traces: imagine more ways of getting to those goals, and imitate them.
                 seeds = decode(
@@ -171,9 +181,8 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                 "rollout/success": float(episodes.success.mean())
                 if len(episodes.success)
                 else np.nan,
-                "rollout/std": float(policy.log_std.detach().exp().mean()),
+                "rollout/std": float(policy(reference)[1].detach().exp().mean()),
                 "curriculum/intermediate": float(labels.mean()),
-                "curriculum/too_hard": float((success <= cfg.goals.r_min).mean()),
                 "curriculum/too_easy": float((success >= cfg.goals.r_max).mean()),
                 "curriculum/replay": len(learner.replay),
                 "curriculum/estimated_coverage": float(estimate.mean()),
@@ -188,7 +197,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                     learner.iteration,
                     goals=goals,
                     success=success,
-                    label=np.where(labels, 0, np.where(success <= cfg.goals.r_min, -1, 1)),
+                    label=np.where(labels, 0, np.where(success < cfg.goals.r_max, -1, 1)),
                     replayed=np.arange(len(goals)) >= len(imagined),
                     replay=learner.replay.goals,
                     traces=traces.paths(env)[:, :FRAME_TRACES],

@@ -25,7 +25,7 @@ class TrpoConfig:
     """Conjugate gradient iterations."""
     cg_damping: float = 0.01
     """Added to the Fisher matrix's diagonal."""
-    fisher_fraction: float = 0.2
+    fisher_fraction: float = 0.3
     """Share of the batch on which Fisher-vector products are taken (the original: 1)."""
     line_search_steps: int = 10
     """Step lengths tried before the update is given up."""

@@ -136,10 +136,10 @@ def test_batched_physics_is_mujocos(name):
     rng = np.random.default_rng(0)
     for _ in range(40):
         action = rng.uniform(-1, 1, env.act_dim)
-        states = env.step(np.array([0]), action[None]).states
-        data.ctrl[:] = action
+        step = env.step(np.array([0]), action[None])
+        data.ctrl[:] = step.actions[0]
         mujoco.mj_step(env.model, data)
-    assert np.array_equal(states[0], np.concatenate([data.qpos, data.qvel]))
+    assert np.array_equal(step.states[0], np.concatenate([data.qpos, data.qvel]))
 
 
 def test_the_ants_achieved_goal_is_mujocos_centre_of_mass():
@@ -252,7 +252,7 @@ def test_the_front_points_at_the_goal():
     turned = ant_maze.renumbered(states, ant_maze.quarter_turns(states, goals))
     assert (ant_maze.quarter_turns(turned, goals) == 0).all()
     ahead, left = env.observations(states, goals)[:, 33:35].T
-    assert (ahead > 0).all() and (np.abs(left) < ahead + 0.2).all()  # of the centre of mass
+    assert (ahead > 0).all() and (np.abs(left) < ahead + 0.1).all()  # of the centre of mass
 
 
 def test_actions_go_to_the_body_and_back():
@@ -272,14 +272,15 @@ def test_the_ants_observation_holds_state_and_goal():
     half = np.sqrt(0.5)
     states[1, 3:7] = half, 0, 0, half  # turned left by a quarter
     states[:, 15:17] = 0.5, 0.1
-    offset = np.array([2.0, 1.0])
+    offset = np.array([3.0, 4.0])  # 5 m away: told as a sixth of it
     obs = env.observations(states, env.achieved_goals(states) + offset)
-    assert np.allclose(obs[0, :29], states[0], atol=1e-6)  # its front points at the goal already
-    assert np.allclose(obs[1, :7], states[0, :7], atol=1e-6)  # renumbered, it is the same Ant
-    assert np.allclose(obs[:, 29:31], offset)
-    assert np.allclose(obs[:, 31:33], [1, 0], atol=1e-6)
-    assert np.allclose(obs[:, 33:35], [2, 1], atol=1e-6)
-    assert np.allclose(obs[:, 35:37], [0.5, 0.1], atol=1e-6)
+    # The goal is to the left: the Ant that faces left already is told as it is.
+    assert np.allclose(obs[1, :29], states[1], atol=1e-6)
+    assert np.allclose(obs[0, :7], states[1, :7], atol=1e-6)  # renumbered, it is the same Ant
+    assert np.allclose(obs[0, 29:31], [0.5, 4 / 6])
+    assert np.allclose(obs[:, 31:33], [0, 1], atol=1e-6)
+    assert np.allclose(obs[0, 33:35], [4 / 6, -0.5], atol=1e-6)
+    assert np.allclose(obs[:, 35:37], [0.1, -0.5], atol=1e-6)
     assert np.allclose(obs[:, 37:39], 0, atol=1e-6)
 
 

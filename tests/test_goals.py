@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from goalgan_bt.goals import GoalReplay, GoalsConfig, SuccessEstimator, intermediate
+from goalgan_bt.goals import GoalMemory, GoalsConfig, SuccessEstimator, intermediate
 
 
 def test_label_edges_are_strict():
@@ -24,7 +24,7 @@ points = st.lists(st.tuples(st.floats(-5, 5), st.floats(-5, 5)), max_size=40)
 @settings(deadline=None)
 @given(points, points)
 def test_replayed_goals_keep_their_distance(first, second):
-    replay = GoalReplay(2, 0.3)
+    replay = GoalMemory(2, 0.3)
     for goals in (first, second):
         replay.add(np.array(goals).reshape(-1, 2))
     kept = replay.goals
@@ -36,12 +36,19 @@ def test_replayed_goals_keep_their_distance(first, second):
 
 
 def test_replay_draws_without_repetition():
-    replay = GoalReplay(1, 0.3)
+    replay = GoalMemory(1, 0.3)
     rng = np.random.default_rng(0)
     assert replay.sample(5, rng).shape == (0, 1)
     replay.add(np.arange(10.0)[:, None])
     assert sorted(replay.sample(100, rng)[:, 0]) == list(range(10))
     assert len(np.unique(replay.sample(4, rng))) == 4
+
+
+def test_distance_to_what_is_kept():
+    memory = GoalMemory(2, 0.3)
+    assert np.isinf(memory.distance_to(np.zeros((2, 2)))).all()
+    memory.add(np.array([[0.0, 0.0], [3.0, 4.0]]))
+    assert memory.distance_to(np.array([[3.0, 3.0], [0.0, -2.0]])).tolist() == [1.0, 2.0]
 
 
 def test_the_estimator_learns_how_hard_goals_are():
