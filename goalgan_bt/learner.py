@@ -14,6 +14,7 @@ from goalgan_bt.gan import GoalGAN
 from goalgan_bt.goals import GoalMemory, SuccessEstimator, intermediate
 from goalgan_bt.imitation import Imitation
 from goalgan_bt.policy import GaussianPolicy, ValueFunction
+from goalgan_bt.rollout import Episodes
 
 
 class Learner:
@@ -48,6 +49,12 @@ class Learner:
         )
         self.transitions = Transitions(env.state_dim, env.act_dim, cfg.backtracking)
         self.imitation = Imitation(self.policy, cfg.imitation, self.noise)
+
+    def remember(self, episodes: Episodes) -> None:
+        """Take in finished episodes: outcomes for the estimator, successes to backtrack from."""
+        first = episodes.from_start
+        self.estimator.add(episodes.goals[first], episodes.success[first])
+        self.transitions.add(episodes.states, episodes.actions, episodes.next_states)
 
     def intermediate(self, goals: FloatArray, success: FloatArray) -> BoolArray:
         """Labels of goals (n, goal_dim) with that success (n,): intermediate difficulty, (n,).

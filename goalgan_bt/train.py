@@ -69,17 +69,20 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
     everyone = np.arange(env.num_envs)
     extra = 0 if cfg.goals.label_rollouts else cfg.goals.labelled
 
-    # Before any curriculum exists, goals are wherever a fresh policy happens to wander.
+    # Before any curriculum exists, goals anywhere tell what is out of reach, and the GAN begins
+    # with wherever a fresh policy happens to wander.
     if learner.iteration == 0:
         anywhere = rng.uniform(env.goal_low, env.goal_high, (1000, env.goal_dim))
         collector.begin(anywhere)
-        rollouts, _ = collector.collect(policy, anywhere)
+        rollouts, episodes = collector.collect(policy, anywhere)
+        learner.remember(episodes)
         learner.steps["train"] += rollouts.rewards.size * cfg.action_repeat
         policy.normaliser.update(flat(rollouts.obs))
         visited = env.achieved_goals(env.read_states(everyone))
         learner.visited.add(visited)
         learner.gan.fit(visited, np.ones(len(visited), dtype=bool), cfg.gan.pretrain_steps)
-    collector.begin(learner.gan.sample(cfg.goals.new))
+    else:
+        collector.begin(learner.gan.sample(cfg.goals.new))
 
     with Progress(f"{env.name}, seed {cfg.seed}") as progress:
         last = False
@@ -104,9 +107,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                     metrics |= update_policy(learner, rollouts, obs, cfg)
 
                     # What the episodes tell: how hard each goal is, what preceded success.
-                    first = episodes.from_start
-                    learner.estimator.add(episodes.goals[first], episodes.success[first])
-                    learner.transitions.add(episodes.states, episodes.actions, episodes.next_states)
+                    learner.remember(episodes)
                     if cfg.backtracking.trace_length:
                         losses = learner.backtracking.fit(learner.transitions)
                         metrics |= group("backtracking", losses)
