@@ -94,10 +94,10 @@ ANT = Config(
     action_repeat=2,
     discount=0.993,
     updates=2,
-    policy=PolicyConfig(init_std=0.25, final_std=0.1),
+    policy=PolicyConfig(init_std=0.2, final_std=0.07),
     rollout=RolloutConfig(num_envs=256, steps=50),
     backtracking=BacktrackingConfig(trace_length=50),
-    imitation=ImitationConfig(steps=5, learning_rate=3e-5, max_kl=0.002),
+    imitation=ImitationConfig(steps=5, learning_rate=1e-5, max_kl=0.0005),
 )
 POINT = Config(
     env="point_umaze",
