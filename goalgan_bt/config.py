@@ -103,7 +103,7 @@ POINT = Config(
     env="point_umaze",
     total_steps=4_000_000,
     discount=0.99,
-    policy=PolicyConfig(init_std=1.0),
+    policy=PolicyConfig(init_std=1.0, final_std=0.3),
     rollout=RolloutConfig(num_envs=256, steps=80),
     trpo=TrpoConfig(max_kl=0.02),
     coverage=CoverageConfig(rollouts=2, every=250_000),

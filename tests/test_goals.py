@@ -2,7 +2,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from goalgan_bt import config
 from goalgan_bt.goals import GoalMemory, GoalsConfig, SuccessEstimator, intermediate
+from goalgan_bt.learner import Learner
+from goalgan_bt.train import make_env
 
 
 def test_label_edges_are_strict():
@@ -80,3 +83,13 @@ def test_the_estimator_forgets_old_episodes():
 
 def test_an_estimator_without_episodes_knows_nothing():
     assert SuccessEstimator(2, GoalsConfig())(np.zeros((3, 2))).tolist() == [0.5] * 3
+
+
+def test_only_goals_near_visited_places_are_intermediate():
+    cfg = config.preset("point_umaze")
+    learner = Learner(make_env(cfg, 1), cfg)
+    learner.visited.add(np.array([[0.0, 0.0]]))
+    near, far = cfg.goals.near * 0.9, cfg.goals.near * 1.1
+    goals = np.array([[near, 0.0], [far, 0.0], [near, 0.0]])
+    labels = learner.intermediate(goals, np.array([0.5, 0.5, 1.0]))
+    assert labels.tolist() == [True, False, False]
