@@ -21,8 +21,12 @@ from goalgan_bt.gan import GanConfig
 from goalgan_bt.goals import GoalsConfig
 from goalgan_bt.imitation import ImitationConfig
 from goalgan_bt.policy import PolicyConfig, ValueConfig
+from goalgan_bt.record import write_atomically
 from goalgan_bt.rollout import RolloutConfig
 from goalgan_bt.trpo import TrpoConfig
+
+# What a resumed run must keep: another world or other randomness would be another run.
+FIXED = ("env", "seed", "map", "dim", "horizon", "action_repeat", "integrator", "out")
 
 
 class ConfigError(ValueError):
@@ -46,7 +50,8 @@ class Config:
     out: Path = Path("runs")
     """Folder of runs; this run gets a folder of its own in it."""
     resume: Path | None = None
-    """Go on with this run (its folder); its settings are the defaults."""
+    """Go on with this run (its folder): its settings are the defaults, and its limits, which count
+    from its beginning, hold unless others are given."""
     map: Path | None = None
     """Text map that replaces the maze: '#' wall, '.' free, 'S' start."""
     dim: int = 2
@@ -78,11 +83,6 @@ class Config:
     coverage: CoverageConfig = field(default_factory=CoverageConfig)
 
     @property
-    def steps_per_iteration(self) -> int:
-        """Environment steps of training in one iteration."""
-        return self.updates * self.rollout.num_envs * self.rollout.steps * self.action_repeat
-
-    @property
     def num_threads(self) -> int:
         """Threads, with 0 resolved to the cores this process may use."""
         return self.threads or len(os.sched_getaffinity(0))
@@ -102,10 +102,13 @@ ANT = Config(
 POINT = Config(
     env="point_umaze",
     total_steps=4_000_000,
-    discount=0.99,
-    policy=PolicyConfig(init_std=1.0, final_std=0.3),
-    rollout=RolloutConfig(num_envs=256, steps=80),
-    trpo=TrpoConfig(max_kl=0.02),
+    action_repeat=2,
+    discount=0.985,
+    updates=2,
+    policy=PolicyConfig(init_std=1.0),
+    value=ValueConfig(minibatch=1024),
+    rollout=RolloutConfig(num_envs=256, steps=40),
+    trpo=TrpoConfig(max_kl=0.05),
     coverage=CoverageConfig(rollouts=2, every=250_000),
     backtracking=BacktrackingConfig(trace_length=20),
 )
@@ -131,34 +134,63 @@ def check(cfg: Config) -> None:
     Raises:
         ConfigError: naming the first such setting.
     """
+    preset(cfg.env)  # is there such an environment?
     above_zero = (
         "iterations total_steps minutes horizon action_repeat updates report_every "
-        "rollout.num_envs "
-        "rollout.steps goals.new policy.init_std policy.min_std value.learning_rate value.epochs "
-        "value.minibatch gan.learning_rate gan.batch gan.steps gan.noise_dim trpo.max_kl "
-        "trpo.cg_iters trpo.fisher_fraction backtracking.batch backtracking.buffer "
-        "backtracking.learning_rate imitation.batch imitation.learning_rate imitation.max_kl "
-        "coverage.rollouts coverage.every goals.near"
+        "rollout.num_envs rollout.steps goals.new goals.near goals.episodes goals.neighbours "
+        "policy.init_std policy.final_std policy.min_std policy.hidden value.hidden "
+        "value.learning_rate value.epochs value.minibatch gan.learning_rate gan.batch gan.steps "
+        "gan.noise_dim gan.pretrain_steps gan.generator_hidden gan.discriminator_hidden "
+        "trpo.max_kl trpo.cg_iters trpo.fisher_fraction trpo.line_search_decay "
+        "backtracking.batch backtracking.buffer backtracking.learning_rate backtracking.hidden "
+        "backtracking.min_transitions backtracking.max_shift imitation.batch "
+        "imitation.learning_rate imitation.max_kl coverage.rollouts coverage.every"
     )
     not_negative = (
         "seed threads goals.old goals.labelled goals.replay_distance goals.label_rollouts "
-        "gan.goal_noise "
-        "gan.pretrain_steps backtracking.trace_length backtracking.steps backtracking.traces "
+        "gan.goal_noise backtracking.trace_length backtracking.steps backtracking.traces "
         "imitation.steps trpo.cg_damping trpo.line_search_steps"
     )
-    shares = "discount gae_lambda rollout.chain goals.r_min goals.r_max trpo.fisher_fraction"
+    shares = (
+        "discount gae_lambda rollout.chain goals.r_min goals.r_max trpo.fisher_fraction "
+        "trpo.line_search_decay"
+    )
     for names, good, what in (
         (above_zero, lambda x: x > 0, "greater than 0"),
         (not_negative, lambda x: x >= 0, "0 or more"),
         (shares, lambda x: 0 <= x <= 1, "between 0 and 1"),
+        (f"{above_zero} {not_negative}", lambda x: x <= 1e12 or x == math.inf, "a sane number"),
     ):
         for name in names.split():
             value: Any = cfg
             for part in name.split("."):
                 value = getattr(value, part)
-            if value is not None and not good(value):
-                flag = name.replace("_", "-")
-                raise ConfigError(f"--{flag} must be {what}, not {value}")
+            parts = value if isinstance(value, tuple) else (value,)
+            flag = "--" + name.replace("_", "-")
+            for x in parts:
+                if x is not None and not isinstance(x, (int, float)):
+                    raise ConfigError(f"{flag} must be a number, not {x!r}")
+                if x is not None and not good(x):
+                    raise ConfigError(f"{flag} must be {what}, not {x}")
+                if x == math.inf and name != "goals.near":
+                    raise ConfigError(f"{flag} must be finite")
+    most = 8 * len(os.sched_getaffinity(0))
+    if cfg.threads > most:
+        raise ConfigError(f"--threads must be at most {most} on this machine, not {cfg.threads}")
+    if cfg.rollout.num_envs > 100_000:
+        raise ConfigError(f"--rollout.num-envs must be at most 100000, not {cfg.rollout.num_envs}")
+    if cfg.policy.final_std is not None and cfg.policy.final_std < cfg.policy.min_std:
+        raise ConfigError("--policy.final-std must not be less than --policy.min-std")
+    if cfg.goals.neighbours > cfg.goals.episodes:
+        raise ConfigError("--goals.neighbours must not be more than --goals.episodes")
+    if cfg.backtracking.min_transitions > cfg.backtracking.buffer:
+        raise ConfigError(
+            "--backtracking.min-transitions must not be more than --backtracking.buffer"
+        )
+    if cfg.horizon is not None and cfg.horizon % cfg.action_repeat:
+        raise ConfigError("--horizon must be a multiple of --action-repeat")
+    if cfg.map is not None and cfg.env == "point_nd":
+        raise ConfigError("point_nd has no walls: --map goes with point_... and ant_... mazes")
     if not 2 <= cfg.dim <= 6:
         raise ConfigError(f"--dim must be 2 to 6, not {cfg.dim}")
     if cfg.goals.r_min >= cfg.goals.r_max:
@@ -177,9 +209,7 @@ def from_command_line(argv: list[str] | None = None) -> Config:
     argv = sys.argv[1:] if argv is None else argv
     default = ANT
     if (run := _value_of(argv, "--resume")) is not None:
-        default = replace(load(Path(run)), iterations=None, total_steps=None, minutes=None)
-        if (env := _value_of(argv, "--env")) not in (None, default.env):
-            raise ConfigError(f"{run} is a run of {default.env}, not {env}: drop --env")
+        default = load(Path(run))
     elif (env := _value_of(argv, "--env")) is not None:
         default = preset(env)
     printed = io.StringIO()
@@ -192,12 +222,18 @@ def from_command_line(argv: list[str] | None = None) -> Config:
             raise
         raise ConfigError(_one_line(printed.getvalue())) from None
     check(cfg)
+    if run is not None:
+        for name in FIXED:
+            if getattr(cfg, name) != getattr(default, name):
+                flag = "--" + name.replace("_", "-")
+                raise ConfigError(f"{flag} of a run cannot change when it is resumed: drop it")
     return cfg
 
 
 def save(cfg: Config, folder: Path) -> None:
     """Write the settings to `config.json` in a run folder."""
-    (folder / "config.json").write_text(json.dumps(asdict(cfg), indent=2, default=str) + "\n")
+    text = json.dumps(asdict(cfg), indent=2, default=str) + "\n"
+    write_atomically(folder / "config.json", lambda file: file.write(text.encode()))
 
 
 def load(folder: Path) -> Config:
@@ -207,7 +243,9 @@ def load(folder: Path) -> Config:
         ConfigError: if the folder is no run or its settings cannot be read.
     """
     try:
-        return _build(Config, json.loads((folder / "config.json").read_text()))
+        cfg = _build(Config, json.loads((folder / "config.json").read_text()))
+        check(cfg)
+        return cfg
     except FileNotFoundError:
         raise ConfigError(f"{folder} is no run: it has no config.json") from None
     except (OSError, ValueError, TypeError) as error:
@@ -247,6 +285,8 @@ def _value_of(argv: list[str], flag: str) -> str | None:
 
 
 def _one_line(text: str) -> str:
-    """What tyro prints in a box, without the box."""
+    """What tyro prints in a box, without the box and without what repeats."""
     words = "".join(" " if c in "╭╮╰╯│─━┃\n" else c for c in text).split()
-    return " ".join(words)
+    line = " ".join(word for word in words if set(word) != {"-"})
+    line = line.removeprefix("Parsing error ").removeprefix("Unrecognized options ")
+    return line.split(" For full helptext")[0][:300] + "; --help lists every setting"

@@ -100,10 +100,10 @@ class SuccessEstimator:
         self.success = np.concatenate([self.success, success])[-self.cfg.episodes :]
 
     def __call__(self, goals: FloatArray) -> FloatArray:
-        """Estimated success, (n, goal_dim) -> (n,) in [0, 1]; 1/2 while nothing is known."""
+        """Estimated success, (n, goal_dim) -> (n,) in [0, 1]; NaN while nothing is known."""
         k = self.cfg.neighbours
         if len(self.goals) < k:
-            return np.full(len(goals), 0.5)
+            return np.full(len(goals), np.nan)
         distance = np.square(goals[:, None] - self.goals).sum(axis=2)
         nearest = np.argpartition(distance, k - 1, axis=1)[:, :k]
         return np.asarray(self.success[nearest].mean(axis=1))

@@ -111,7 +111,11 @@ class Learner:
                 sizes.
         """
         for name, module in self._modules().items():
+            groups = getattr(module, "param_groups", [])
+            rates = [group["lr"] for group in groups]
             module.load_state_dict(state["modules"][name])
+            for group, rate in zip(getattr(module, "param_groups", []), rates, strict=True):
+                group["lr"] = rate  # the settings' learning rate, which a resumed run may change
         self.iteration = int(state["iteration"])
         self.steps = {name: int(state["steps"][name]) for name in self.steps}
         self.seconds = float(state["seconds"])
@@ -122,8 +126,7 @@ class Learner:
         self.visited.goals = state["visited"].numpy().copy()
         self.estimator.goals = state["estimator_goals"].numpy().copy()
         self.estimator.success = state["estimator_success"].numpy().copy()
-        saved, rows = state["transitions"], self.transitions
-        size = len(saved["states"])
-        for name in ("states", "actions", "next_states"):
-            getattr(rows, name)[:size] = saved[name].numpy()
-        rows.size, rows.cursor = size, int(saved["cursor"])
+        saved = state["transitions"]
+        oldest = int(saved["cursor"]) % max(1, len(saved["states"]))
+        columns = ("states", "actions", "next_states")
+        self.transitions.add(*(np.roll(saved[name].numpy(), -oldest, axis=0) for name in columns))

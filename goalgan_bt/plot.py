@@ -37,7 +37,7 @@ def main() -> int:
             raise RunError('plots need matplotlib: pip install "goalgan_bt[plots]"') from None
         path = cfg.out or cfg.runs[0] / "coverage.png"
         pictures.overview(list(cfg.runs), cfg.maps).savefig(path, dpi=150)
-    except (RunError, OSError) as error:
+    except (RunError, OSError, ValueError) as error:
         complain(str(error))
         return 2
     say(str(path))

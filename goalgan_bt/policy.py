@@ -25,7 +25,8 @@ class PolicyConfig:
     min_std: float = 0.05
     """The standard deviation never falls below this."""
     final_std: float | None = None
-    """If given, the standard deviation is kept below a line from init_std to this over the run."""
+    """If given, the standard deviation is bounded by a line from init_std to this over the run;
+    once on the line it follows it."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ class GaussianPolicy(nn.Module):
         self.cap_std(0.0)
 
     def cap_std(self, progress: float) -> None:
-        """Lower the bound on the standard deviation; progress in the run, 0 to 1."""
+        """Set the bound on the standard deviation for this progress in the run, 0 to 1."""
         first, last = self.cfg.init_std, self.cfg.final_std
         self._max_std = math.inf if last is None else first + min(progress, 1.0) * (last - first)
 

@@ -17,6 +17,7 @@ import platform
 import subprocess
 import sys
 import time
+import zipfile
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ class RunError(ValueError):
 
 def create_folder(out: Path, env: str, seed: int) -> Path:
     """A new, empty run folder `<env>-<time>-s<seed>` in `out`."""
+    reason: str | None = "all names are taken"
     name = f"{env}-{time.strftime('%Y%m%d-%H%M%S')}-s{seed}"
     for attempt in range(1, 1000):
         folder = out / (name if attempt == 1 else f"{name}-{attempt}")
@@ -42,9 +44,10 @@ def create_folder(out: Path, env: str, seed: int) -> Path:
             return folder
         except FileExistsError:
             continue
-        except NotADirectoryError:
+        except OSError as error:
+            reason = error.strerror
             break
-    raise RunError(f"cannot make a run folder in {out}: choose another with --out")
+    raise RunError(f"cannot make a run folder in {out} ({reason}): choose another with --out")
 
 
 def write_meta(folder: Path, maze: Maze | None) -> None:
@@ -167,9 +170,14 @@ def read_metrics(folder: Path) -> tuple[list[str], list[dict[str, str]]]:
         with (folder / "metrics.csv").open(newline="") as file:
             reader = csv.DictReader(file)
             rows = [row for row in reader if None not in row.values()]
-            return list(reader.fieldnames or []), rows
+            columns = list(reader.fieldnames or [])
     except OSError:
         raise RunError(f"{folder} is no run: it has no metrics.csv") from None
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise RunError(f"{folder / 'metrics.csv'} is damaged: {error}") from None
+    if columns and not all(row.get("iteration", "").isdigit() for row in rows):
+        raise RunError(f"{folder / 'metrics.csv'} is damaged: a row has no iteration")
+    return columns, rows
 
 
 def read_meta(folder: Path) -> dict[str, Any]:
@@ -189,7 +197,23 @@ def read_meta(folder: Path) -> dict[str, Any]:
 
 def frames(folder: Path) -> list[Path]:
     """The frames of a run, oldest first."""
-    return sorted((folder / "frames").glob("[0-9]*.npz"))
+    return sorted(f for f in (folder / "frames").glob("*.npz") if f.stem.isdigit())
+
+
+def read_frame(path: Path) -> dict[str, np.ndarray[Any, Any]]:
+    """The arrays of a frame (see `Record.frame`).
+
+    Raises:
+        RunError: if it cannot be read.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            arrays = {name: data[name] for name in data.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise RunError(f"cannot read the frame {path}: {error}") from None
+    if "coverage" not in arrays:
+        raise RunError(f"{path} is no frame of a run")
+    return arrays
 
 
 def _tensorboard(folder: Path) -> Any:

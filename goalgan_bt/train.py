@@ -60,6 +60,12 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
     learner = Learner(env, cfg)
     if cfg.resume is not None:
         checkpoint.load(learner, folder)
+        if finished(cfg, learner, learner.seconds) >= 1:
+            raise config.ConfigError(
+                f"{folder} has reached its limits ({learner.iteration} iterations, "
+                f"{learner.steps['train']} steps): ask for more, for example with --total-steps"
+            )
+    config.save(cfg, folder)
     policy, rng, noise = learner.policy, learner.rng, learner.noise
     collector = Collector(env, cfg.rollout, rng, noise)
     test_goals = env.test_goals()
@@ -136,7 +142,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                 # Recall traces: imagine more ways of getting to those goals, and imitate them.
                 seeds = decode(
                     env,
-                    goals[labels][: cfg.backtracking.traces],
+                    rng.permutation(goals[labels])[: cfg.backtracking.traces],
                     learner.transitions.sample_states(SEED_STATES, rng),
                     cfg.backtracking.max_shift,
                     rng,
@@ -155,7 +161,8 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                         policy.normaliser(trace_obs), trace_actions, reference
                     ),
                 )
-                # Only now: the policy must not change under data that it made.
+                # Only now: the policy must not change under data that it made. The last batch
+                # stands for all of the iteration's.
                 policy.normaliser.update(flat(rollouts.obs))
 
             # Coverage, once in a while; then everything that a viewer reads.
@@ -193,7 +200,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
             records.metrics(metrics)
             if measure or learner.iteration % cfg.report_every == 0:
                 done = finished(cfg, learner, clock.total())
-                progress.report(metrics, clock.total() * (1 / done - 1) if done else np.inf)
+                progress.report(metrics, clock.total() * max(1 / done - 1, 0) if done else np.inf)
                 records.frame(
                     learner.iteration,
                     goals=goals,
@@ -347,27 +354,39 @@ def main() -> int:
             cfg = config.from_command_line()
             env = make_env(cfg, 1)
             folder = cfg.resume or record.create_folder(cfg.out, env.name, cfg.seed)
-            config.save(cfg, folder)
-            record.write_meta(folder, env.maze)
+            if cfg.resume is None:
+                record.write_meta(folder, env.maze)
             say(f"run folder: {folder}")
             coverage, steps = train(cfg, folder, stop)
     except KeyboardInterrupt:
-        kept = "" if folder is None else f"; --resume {folder} goes on from the last checkpoint"
-        complain(f"interrupted{kept}")
+        complain(f"interrupted{how_to_go_on(folder)}")
         return 130
     except (ValueError, OSError) as error:
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-            complain(f"the disk is full: free some space, then go on with --resume {folder}")
+            complain(f"the disk is full: free some space{how_to_go_on(folder)}")
+        elif isinstance(error, BrokenPipeError):
+            sys.stdout = sys.stderr  # nobody reads standard output any more
+            complain(f"standard output was closed{how_to_go_on(folder)}")
         elif isinstance(error, (config.ConfigError, record.RunError, MapError, OSError)):
             complain(str(error))
         else:
             raise
+        return 2
+    except MemoryError:
+        complain("out of memory: use a smaller --rollout.num-envs")
         return 2
     if stop.signal is not None:
         complain(f"stopped by {signal.Signals(stop.signal).name}: go on with --resume {folder}")
         return 130 if stop.signal == signal.SIGINT else 2
     say(f"coverage {coverage:.3f} after {steps:,} training steps: {folder}")
     return 0
+
+
+def how_to_go_on(folder: Path | None) -> str:
+    """The end of a message about a run that stopped early."""
+    if folder is None or not (folder / "checkpoint.pt").exists():
+        return ": nothing was saved yet, start again"
+    return f": go on from the last checkpoint with --resume {folder}"
 
 
 def script() -> None:

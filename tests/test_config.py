@@ -34,6 +34,18 @@ def test_the_command_line_overrides_the_preset(env):
         (["--no-such-flag", "1"], "no-such-flag"),
         (["--seed", "three"], "three"),
         (["--resume", "nowhere"], "nowhere is no run"),
+        (["--policy.final-std", "0"], "--policy.final-std must be greater than 0"),
+        (["--policy.final-std", "0.01"], "must not be less than --policy.min-std"),
+        (["--policy.hidden", "8", "-5"], "--policy.hidden"),
+        (["--backtracking.min-transitions", "0"], "greater than 0"),
+        (["--backtracking.buffer", "10"], "--backtracking.min-transitions must not be more"),
+        (["--seed", "99999999999999999999999"], "--seed must be a sane number"),
+        (["--rollout.num-envs", "1000000000"], "--rollout.num-envs must be at most"),
+        (["--threads", "100000000"], "--threads must be at most"),
+        (["--trpo.max-kl", "inf"], "--trpo.max-kl must be finite"),
+        (["--goals.neighbours", "0"], "greater than 0"),
+        (["--horizon", "7", "--action-repeat", "3"], "multiple of --action-repeat"),
+        (["--env", "point_nd", "--map", "x.txt"], "point_nd has no walls"),
     ],
 )
 def test_bad_flags_are_one_clear_line(flags, message):
@@ -55,15 +67,18 @@ def test_resume_starts_from_the_runs_settings(tmp_path):
     config.save(config.from_command_line(["--env", "point_spiral", "--seed", "3"]), tmp_path)
     cfg = config.from_command_line(["--resume", str(tmp_path), "--iterations", "9"])
     assert (cfg.env, cfg.seed, cfg.iterations) == ("point_spiral", 3, 9)
-    with pytest.raises(ConfigError, match="drop --env"):
+    with pytest.raises(ConfigError, match="--env of a run cannot change"):
         config.from_command_line(["--resume", str(tmp_path), "--env", "ant_umaze"])
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"nonsense": 1}', '{"trpo": 3}'])
+@pytest.mark.parametrize(
+    "text", ["{", "[]", '{"nonsense": 1}', '{"trpo": 3}', '{"env": "moon"}', '{"discount": "x"}']
+)
 def test_damaged_settings_are_refused(tmp_path, text):
     (tmp_path / "config.json").write_text(text)
-    with pytest.raises(ConfigError, match=r"config\.json"):
+    with pytest.raises(ConfigError) as error:
         config.load(tmp_path)
+    assert "\n" not in str(error.value)
 
 
 def test_help_explains_every_setting(capsys):

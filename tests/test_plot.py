@@ -1,3 +1,4 @@
+import shutil
 import subprocess
 import sys
 
@@ -43,6 +44,30 @@ def test_the_maps_tiles_fill_the_free_cells(folder):
     ax = figure.axes[0]
     assert len(ax.patches) == 112
     assert ax.patches[0].get_width() == pytest.approx(0.5)
+
+
+def test_runs_of_any_name_can_be_drawn(folder, tmp_path):
+    """Also those for which nothing was ever published, and several together."""
+    other = tmp_path / "ant_spiral-test"
+    shutil.copytree(folder, other)
+    done = plot(other, folder, "--out", tmp_path / "c.png")
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("damage", ["frame", "meta", "metrics"])
+def test_damaged_runs_are_one_line(folder, tmp_path, damage):
+    other = tmp_path / "point_umaze-damaged"
+    shutil.copytree(folder, other)
+    if damage == "frame":
+        frame = record.frames(other)[0]
+        frame.write_bytes(frame.read_bytes()[:100])
+    elif damage == "meta":
+        (other / "meta.json").write_text("{}")
+    else:
+        (other / "metrics.csv").write_bytes(bytes(range(256)))
+    done = plot(other)
+    assert done.returncode == 2
+    assert len(done.stderr.strip().splitlines()) == 1 and "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("where", ["nowhere", "."])

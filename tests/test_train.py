@@ -20,7 +20,10 @@ TINY = {
     "ant_umaze": "--rollout.num-envs 32 --rollout.steps 50 --backtracking.min-transitions 200",
     "point_nd": "--rollout.num-envs 32 --rollout.steps 50 --backtracking.min-transitions 200",
 }
-FAST = "--horizon 60 --coverage.rollouts 1 --gan.pretrain-steps 20 --gan.steps 10"
+FAST = (
+    "--action-repeat 1 --updates 1 --horizon 60 --coverage.rollouts 1 --gan.pretrain-steps 20 "
+    "--gan.steps 10 --policy.final-std None"
+)
 
 
 def settings(env, *more):
@@ -110,19 +113,68 @@ def test_resume_goes_on_where_the_checkpoint_was(tmp_path):
 
 
 def test_a_checkpoint_holds_everything(tmp_path):
-    train(settings("point_umaze", "--iterations", "3"), tmp_path)
-    cfg = settings("point_umaze", "--seed", "9")
-    env = make_env(cfg, 2)
-    a, b = Learner(env, cfg), Learner(env, cfg)
-    checkpoint.load(a, tmp_path)
-    checkpoint.save(a, tmp_path)
-    checkpoint.load(b, tmp_path)
-    assert a.iteration == b.iteration == 3
-    assert a.rng.random() == b.rng.random()
-    assert torch.equal(a.gan._noise(3), b.gan._noise(3))
-    assert np.array_equal(a.estimator(env.test_goals()), b.estimator(env.test_goals()))
-    assert np.array_equal(a.transitions.states, b.transitions.states)
-    assert torch.equal(a.policy.normaliser.var, b.policy.normaliser.var)
+    """A learner of another seed becomes the one that was saved, in every part."""
+    cfg, other = settings("ant_umaze", "--seed", "1"), settings("ant_umaze", "--seed", "9")
+    env = make_env(cfg, 8)
+    train(replace(cfg, iterations=6), tmp_path)
+    saved, loaded = Learner(env, cfg), Learner(env, other)
+    checkpoint.load(saved, tmp_path)
+    assert saved.iteration == 6 and len(saved.visited) > 3 and saved.transitions.size > 0
+    loaded.load_state_dict(saved.state_dict())
+    for x, y in ((saved, loaded),):
+        assert x.rng.random() == y.rng.random()
+        assert torch.equal(x.gan._noise(3), y.gan._noise(3))
+        assert (x.steps, x.seconds, x.next_coverage) == (y.steps, y.seconds, y.next_coverage)
+        assert np.array_equal(x.replay.goals, y.replay.goals)
+        assert np.array_equal(x.visited.goals, y.visited.goals)
+        assert np.array_equal(x.estimator.goals, y.estimator.goals)
+        assert np.array_equal(x.estimator.success, y.estimator.success)
+        assert np.array_equal(x.transitions.states, y.transitions.states)
+        assert x.transitions.cursor == y.transitions.cursor
+        for name, module in x._modules().items():
+            ours, theirs = module.state_dict(), y._modules()[name].state_dict()
+            assert repr(ours) == repr(theirs), name
+
+
+def test_a_failed_resume_leaves_the_run_as_it_was(tmp_path):
+    out = tmp_path / "runs"
+    assert run("--env", "point_umaze", "--iterations", 2, out=out).returncode == 0
+    (folder,) = out.iterdir()
+    before = {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
+    for flags, message in (
+        (["--iterations", 4, "--policy.hidden", 5], "cannot resume"),
+        (["--iterations", 2], "has reached its limits"),
+        (["--iterations", 4, "--seed", 7], "--seed of a run cannot change"),
+    ):
+        done = run("--resume", folder, *flags, out=out)
+        assert done.returncode == 2 and message in done.stderr
+        assert before == {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
+    assert run("--resume", folder, "--iterations", 3, out=out).returncode == 0
+
+
+def test_a_resumed_learner_takes_new_learning_rates_and_buffers(tmp_path):
+    train(settings("ant_umaze", "--iterations", "8"), tmp_path)
+    more = "--value.learning-rate", "0.5", "--backtracking.buffer", "200000"
+    cfg = settings("ant_umaze", *more)
+    learner = Learner(make_env(cfg, 2), cfg)
+    checkpoint.load(learner, tmp_path)
+    assert learner.value.optimiser.param_groups[0]["lr"] == 0.5
+    rows = learner.transitions
+    rows.add(
+        *(np.ones((4, x.shape[1]), np.float32) for x in (rows.states, rows.actions, rows.states))
+    )
+    assert np.abs(rows.states[: rows.size]).sum(axis=1).min() > 0  # no row of zeros
+
+
+def test_closed_standard_output_is_one_line(tmp_path):
+    words = command("--env", "point_umaze", "--iterations", 40, "--report-every", 1, out=tmp_path)
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process.stdout.readline()
+    process.stdout.close()
+    errors = process.stderr.read()
+    assert process.wait(timeout=60) == 2
+    assert "standard output was closed" in errors.splitlines()[0]
+    assert "Traceback" not in errors
 
 
 @pytest.mark.parametrize("damage", ["missing", "cut", "empty", "other sizes", "pickle"])
@@ -205,9 +257,11 @@ def test_a_full_disk_is_one_line(tmp_path):
     folder = process.stdout.readline().removeprefix("run folder: ").strip()
     process.stdout.readline()
     path = tmp_path / folder / "metrics.csv"
-    time.sleep(0.1)
-    path.unlink()
-    path.symlink_to("/dev/full")
+    while process.poll() is None:  # new columns may put a real file in its place again
+        if not path.is_symlink():
+            path.unlink(missing_ok=True)
+            path.symlink_to("/dev/full")
+        time.sleep(0.01)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 2
     assert "the disk is full" in errors and len(errors.strip().splitlines()) == 1

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from goalgan_bt import record
-from goalgan_bt.envs.maze import Maze
+from goalgan_bt.envs.maze import MapError, Maze
 
 # Red (never reached) over pale yellow to blue (mastered): readable for colour-blind people.
 COLOURS = "RdYlBu"
@@ -34,8 +34,11 @@ def maze_of(folder: Path) -> Maze | None:
     Raises:
         RunError: if the folder is no run.
     """
-    maze = record.read_meta(folder)["maze"]
-    return None if maze is None else Maze(tuple(maze["rows"]), maze["cell_size"])
+    try:
+        maze = record.read_meta(folder)["maze"]
+        return None if maze is None else Maze(tuple(maze["rows"]), maze["cell_size"])
+    except (KeyError, TypeError, MapError) as error:
+        raise record.RunError(f"{folder / 'meta.json'} is damaged: {error!r}") from None
 
 
 def coverage_curve(ax: Axes, folders: list[Path]) -> None:
@@ -44,7 +47,7 @@ def coverage_curve(ax: Axes, folders: list[Path]) -> None:
     Raises:
         RunError: if a folder is no run.
     """
-    names = set()
+    names: dict[str, None] = {}  # in the order given
     for i, folder in enumerate(folders):
         _, rows = record.read_metrics(folder)
         points = [
@@ -54,11 +57,11 @@ def coverage_curve(ax: Axes, folders: list[Path]) -> None:
         ]
         steps, coverage = zip(*points, strict=True) if points else ((), ())
         ax.plot(steps, coverage, color=f"C{i}", label=folder.name, marker=".", markersize=4)
-        names.add(folder.name.split("-")[0])
-    for name, style in zip(names, ("--", ":", "-."), strict=False):
-        for (label, points), grey in zip(PUBLISHED.get(name, []), ("0.65", "0.35"), strict=True):
+        names[folder.name.split("-")[0]] = None
+    for name in names:
+        for (label, points), grey in zip(PUBLISHED.get(name, []), ("0.65", "0.35"), strict=False):
             steps, coverage = zip(*points, strict=True)
-            ax.plot(steps, coverage, style, color=grey, marker="o", markersize=3, label=label)
+            ax.plot(steps, coverage, "--", color=grey, marker="o", markersize=3, label=label)
             ax.set_xscale("log")
     ax.set(xlabel="environment steps of training", ylabel="coverage", ylim=(0, 1))
     ax.grid(alpha=0.25)
@@ -85,8 +88,7 @@ def coverage_map(ax: Axes, folder: Path, frame: Path, goals: bool = True) -> Any
     maze = maze_of(folder)
     if maze is None:
         raise record.RunError(f"{folder} has no maze to draw: only its curve can be plotted")
-    with np.load(frame, allow_pickle=False) as data:
-        arrays = {name: data[name] for name in data.files}
+    arrays = record.read_frame(frame)
     measured = not np.isnan(arrays["coverage"]).all()
     rate = arrays["coverage"] if measured else arrays["estimate"]
     tiles = arrays["test_goals"]
@@ -112,12 +114,11 @@ def coverage_map(ax: Axes, folder: Path, frame: Path, goals: bool = True) -> Any
 
 def measured_frames(folder: Path) -> list[Path]:
     """The frames that hold a measured coverage, oldest first."""
-    chosen = []
-    for frame in record.frames(folder):
-        with np.load(frame, allow_pickle=False) as data:
-            if not np.isnan(data["coverage"]).all():
-                chosen.append(frame)
-    return chosen
+    return [
+        frame
+        for frame in record.frames(folder)
+        if not np.isnan(record.read_frame(frame)["coverage"]).all()
+    ]
 
 
 def overview(folders: list[Path], maps: int = 4) -> Figure:
@@ -139,13 +140,11 @@ def overview(folders: list[Path], maps: int = 4) -> Figure:
         if not frames:
             raise record.RunError(f"{folder} holds no report yet: wait for its first evaluation")
         picks = np.unique(np.linspace(0, len(frames) - 1, maps).round().astype(int))
-        for c, pick in enumerate(picks):
-            ax = figure.add_subplot(grid[r, c])
+        axes = [figure.add_subplot(grid[r, c]) for c in range(len(picks))]
+        for ax, pick in zip(axes, picks, strict=True):
             image = coverage_map(ax, folder, frames[pick])
-            if c == 0:
-                ax.set_ylabel(folder.name, fontsize=7)
-                if r == 0:
-                    ax.legend(fontsize=6, loc="center left", bbox_to_anchor=(0.0, 0.5))
-        figure.colorbar(image, ax=ax, label="success", shrink=0.8)
+        axes[0].set_ylabel(folder.name, fontsize=7)
+        axes[0].legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=3)
+        figure.colorbar(image, ax=axes, label="success", shrink=0.8)
     coverage_curve(figure.add_subplot(grid[rows, :]), folders)
     return figure
