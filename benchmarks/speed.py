@@ -91,7 +91,7 @@ def main() -> None:
     for env in settings.env:
         for threads in settings.threads:
             cfg = replace(config.preset(env), threads=threads)
-            torch.set_num_threads(threads)
+            torch.set_num_threads(cfg.learning_threads)
             raw_batch(cfg, 1.0)  # warm-up
             collection(cfg, 1.0)
             measured: dict[str, list[float]] = {"raw_batch": [], "collection": [], "training": []}

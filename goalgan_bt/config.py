@@ -63,7 +63,9 @@ class Config:
     action_repeat: int = 1
     """Steps of 0.02 s for which the policy holds each action (the original: 1)."""
     threads: int = 0
-    """Threads for simulation and for learning; 0 is one per core."""
+    """Simulation threads; 0 is one per core."""
+    learning_threads: int = 1
+    """Threads of torch. More than one pays only on idle cores: they wait for each other busily."""
     discount: float = 0.995
     """Discount factor per action (the original: 0.99)."""
     gae_lambda: float = 0.95
@@ -136,7 +138,8 @@ def check(cfg: Config) -> None:
     """
     preset(cfg.env)  # is there such an environment?
     above_zero = (
-        "iterations total_steps minutes horizon action_repeat updates report_every "
+        "iterations total_steps minutes horizon action_repeat learning_threads updates "
+        "report_every "
         "rollout.num_envs rollout.steps goals.new goals.near goals.episodes goals.neighbours "
         "policy.init_std policy.final_std policy.min_std policy.hidden value.hidden "
         "value.learning_rate value.epochs value.minibatch gan.learning_rate gan.batch gan.steps "

@@ -55,7 +55,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
         folder: the run folder (see `goalgan_bt.record`).
         stop: asked after every iteration whether to end early.
     """
-    torch.set_num_threads(cfg.num_threads)
+    torch.set_num_threads(cfg.learning_threads)
     env, test_env = make_env(cfg, cfg.rollout.num_envs), make_env(cfg, TEST_ENVS)
     learner = Learner(env, cfg)
     if cfg.resume is not None:
