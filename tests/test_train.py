@@ -72,13 +72,14 @@ def test_a_tiny_run_leaves_a_whole_run_folder(env, tmp_path):
 
 
 def test_recall_traces_are_learned_and_imitated(tmp_path):
-    train(settings("ant_umaze", "--iterations", "12"), tmp_path)
+    tiny = "--iterations", "14", "--goals.near", "inf", "--goals.neighbours", "4"
+    train(settings("ant_umaze", *tiny), tmp_path)
     rows = columns(tmp_path)
     assert any(r.get("imitation/loss") for r in rows)
     assert any(r.get("backtracking/state_nll") for r in rows)
     plain = tmp_path / "plain"
     plain.mkdir()
-    train(settings("ant_umaze", "--iterations", "12", "--backtracking.trace-length", "0"), plain)
+    train(settings("ant_umaze", *tiny, "--backtracking.trace-length", "0"), plain)
     assert not any(r.get("imitation/loss") for r in columns(plain))
 
 
