@@ -88,7 +88,7 @@ def test_an_estimator_without_episodes_knows_nothing():
 
 
 def test_only_goals_near_visited_places_are_intermediate():
-    cfg = config.preset("point_umaze")
+    cfg = config.preset("ant_umaze")
     learner = Learner(make_env(cfg, 1), cfg)
     learner.visited.add(np.array([[0.0, 0.0]]))
     near, far = cfg.goals.near * 0.9, cfg.goals.near * 1.1
