@@ -35,7 +35,8 @@ class ConfigError(ValueError):
 
 @dataclass(frozen=True)
 class Config:
-    """Learn to reach every free point of a maze: Goal GAN, recall traces, TRPO."""
+    """Learn to reach every free point of a maze: Goal GAN, recall traces, TRPO. The defaults shown
+    are those of the environment given with --env, or of ant_umaze."""
 
     env: str = "ant_umaze"
     """Environment: {point,ant}_{umaze,spiral,medium,large} or point_nd. Picks the preset."""
