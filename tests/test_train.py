@@ -41,6 +41,17 @@ def run(*flags, out):
     return subprocess.run(command(*flags, out=out), capture_output=True, text=True, timeout=120)
 
 
+def start(out):
+    """A run without an end, in the background, and its run folder."""
+    process = subprocess.Popen(
+        command("--env", "point_umaze", "--report-every", 1, out=out),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    return process, process.stdout.readline().removeprefix("run folder: ").strip()
+
+
 def columns(folder):
     """metrics.csv without the columns that measure time."""
     _, rows = record.read_metrics(folder)
@@ -123,19 +134,19 @@ def test_a_checkpoint_holds_everything(tmp_path):
     checkpoint.load(saved, tmp_path)
     assert saved.iteration == 6 and len(saved.visited) > 3 and saved.transitions.size > 0
     loaded.load_state_dict(saved.state_dict())
-    for x, y in ((saved, loaded),):
-        assert x.rng.random() == y.rng.random()
-        assert torch.equal(x.gan._noise(3), y.gan._noise(3))
-        assert (x.steps, x.seconds, x.next_coverage) == (y.steps, y.seconds, y.next_coverage)
-        assert np.array_equal(x.replay.goals, y.replay.goals)
-        assert np.array_equal(x.visited.goals, y.visited.goals)
-        assert np.array_equal(x.estimator.goals, y.estimator.goals)
-        assert np.array_equal(x.estimator.success, y.estimator.success)
-        assert np.array_equal(x.transitions.states, y.transitions.states)
-        assert x.transitions.cursor == y.transitions.cursor
-        for name, module in x._modules().items():
-            ours, theirs = module.state_dict(), y._modules()[name].state_dict()
-            assert repr(ours) == repr(theirs), name
+    x, y = saved, loaded
+    assert x.rng.random() == y.rng.random()
+    assert torch.equal(x.gan._noise(3), y.gan._noise(3))
+    assert (x.steps, x.seconds, x.next_coverage) == (y.steps, y.seconds, y.next_coverage)
+    assert np.array_equal(x.replay.goals, y.replay.goals)
+    assert np.array_equal(x.visited.goals, y.visited.goals)
+    assert np.array_equal(x.estimator.goals, y.estimator.goals)
+    assert np.array_equal(x.estimator.success, y.estimator.success)
+    assert np.array_equal(x.transitions.states, y.transitions.states)
+    assert x.transitions.cursor == y.transitions.cursor
+    for name, module in x._modules().items():
+        ours, theirs = module.state_dict(), y._modules()[name].state_dict()
+        assert repr(ours) == repr(theirs), name
 
 
 def test_a_failed_resume_leaves_the_run_as_it_was(tmp_path):
@@ -228,13 +239,7 @@ def test_a_broken_map_names_its_place(tmp_path):
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 2)])
 def test_interrupted_runs_leave_a_checkpoint_that_resumes(tmp_path, number, code):
-    process = subprocess.Popen(
-        command("--env", "point_umaze", "--report-every", 1, out=tmp_path),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    folder = process.stdout.readline().removeprefix("run folder: ").strip()
+    process, folder = start(out=tmp_path)
     for _ in range(3):
         assert "steps" in process.stdout.readline()
     process.send_signal(number)
@@ -250,13 +255,7 @@ def test_interrupted_runs_leave_a_checkpoint_that_resumes(tmp_path, number, code
 
 def test_a_full_disk_is_one_line(tmp_path):
     """/dev/full takes no byte: the run's metrics go there."""
-    process = subprocess.Popen(
-        command("--env", "point_umaze", "--report-every", 1, out=tmp_path),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    folder = process.stdout.readline().removeprefix("run folder: ").strip()
+    process, folder = start(out=tmp_path)
     process.stdout.readline()
     path = tmp_path / folder / "metrics.csv"
     while process.poll() is None:  # new columns may put a real file in its place again
