@@ -71,7 +71,7 @@ def collection(cfg: Config, seconds: float) -> float:
     steps, begin = 0, time.perf_counter()
     while time.perf_counter() - begin < seconds:
         rollouts, _ = collector.collect(learner.policy, goals)
-        steps += rollouts.rewards.size
+        steps += rollouts.rewards.size * cfg.action_repeat
     return steps / (time.perf_counter() - begin)
 
 

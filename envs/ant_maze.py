@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from goalgan_bt.envs.batch import INTEGRATORS, MujocoEnv, add_walls
+from goalgan_bt.envs.batch import INTEGRATORS, MazeEnv, add_walls
 from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
 
 TORSO_RADIUS = 0.25  # m
@@ -41,7 +41,7 @@ def build_model(maze: Maze, integrator: str = "implicitfast") -> mujoco.MjModel:
     return spec.compile()
 
 
-class AntMaze(MujocoEnv):
+class AntMaze(MazeEnv):
     """Walk to any point of a maze; success within 1 m.
 
     State: qpos (15: x, y, z in m, torso quaternion w, x, y, z, joint angles in rad) and qvel
@@ -70,10 +70,8 @@ class AntMaze(MujocoEnv):
         threads: int,
         integrator: str,
     ) -> None:
-        self.maze = maze
-        self.goal_low, self.goal_high = maze.low, maze.high
-        super().__init__(build_model(maze, integrator), num_envs, horizon, action_repeat, threads)
-        self._maze = maze
+        model = build_model(maze, integrator)
+        super().__init__(maze, model, num_envs, horizon, action_repeat, threads)
         mass = self.model.body_mass
         first = self.model.body("front_left_leg").id  # upper leg (fixed), lower leg, foot
         self._leg_share, self._foot_share = mass[first + 1 : first + 3] / mass.sum()
@@ -133,14 +131,8 @@ class AntMaze(MujocoEnv):
         """Healthy, the torso a radius away from every wall, no knee or foot inside one."""
         free = self.healthy(states)
         for corner in TORSO_RADIUS * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]):
-            free &= self._maze.is_free(states[:, :2] + corner)
-        return np.asarray(free & self._maze.is_free(self._joints(states)).all(axis=1))
-
-    def feasible(self, goals: FloatArray) -> BoolArray:
-        return self._maze.is_free(goals)
-
-    def test_goals(self) -> FloatArray:
-        return self._maze.tiles()
+            free &= self.maze.is_free(states[:, :2] + corner)
+        return np.asarray(free & self.maze.is_free(self._joints(states)).all(axis=1))
 
     def repair(self, states: FloatArray) -> FloatArray:
         """The torso's quaternion brought back to length 1."""

@@ -237,6 +237,36 @@ class MujocoEnv(GoalEnv):
         self.batch.step(ids, nstep=self.action_repeat)
 
 
+class MazeEnv(MujocoEnv):
+    """A body in a maze, whose goals are places, (x, y) in metres.
+
+    Args:
+        maze: the layout.
+        model, num_envs, horizon, action_repeat, threads: see `MujocoEnv`.
+    """
+
+    maze: Maze
+
+    def __init__(
+        self,
+        maze: Maze,
+        model: mujoco.MjModel,
+        num_envs: int,
+        horizon: int,
+        action_repeat: int,
+        threads: int,
+    ) -> None:
+        self.maze = maze
+        self.goal_low, self.goal_high = maze.low, maze.high
+        super().__init__(model, num_envs, horizon, action_repeat, threads)
+
+    def feasible(self, goals: FloatArray) -> BoolArray:
+        return self.maze.is_free(goals)
+
+    def test_goals(self) -> FloatArray:
+        return self.maze.tiles()
+
+
 INTEGRATORS = {
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
     "rk4": mujoco.mjtIntegrator.mjINT_RK4,

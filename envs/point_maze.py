@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from goalgan_bt.envs.batch import INTEGRATORS, Ids, MujocoEnv, add_walls
+from goalgan_bt.envs.batch import INTEGRATORS, Ids, MazeEnv, add_walls
 from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
 
 RADIUS = 0.1  # m
@@ -37,7 +37,7 @@ def build_model(maze: Maze, integrator: str = "implicitfast") -> mujoco.MjModel:
     return spec.compile()
 
 
-class PointMaze(MujocoEnv):
+class PointMaze(MazeEnv):
     """Reach any point of a maze by pushing; success within 0.3 m.
 
     State: x, y (m), vx, vy (m/s). Observation: the state and the offset to the desired goal, 6
@@ -58,17 +58,15 @@ class PointMaze(MujocoEnv):
         threads: int,
         integrator: str,
     ) -> None:
-        self.maze = maze
-        self.goal_low, self.goal_high = maze.low, maze.high
-        super().__init__(build_model(maze, integrator), num_envs, horizon, action_repeat, threads)
-        self._maze = maze
+        model = build_model(maze, integrator)
+        super().__init__(maze, model, num_envs, horizon, action_repeat, threads)
 
     def advance(self, ids: Ids, actions: FloatArray) -> None:
         self._ctrl[ids] = actions
         for _ in range(self.action_repeat):
             before = self._qpos[ids]
             self.batch.step(ids)
-            self._qpos[ids], stopped = self._maze.slide(before, self._qpos[ids], RADIUS)
+            self._qpos[ids], stopped = self.maze.slide(before, self._qpos[ids], RADIUS)
             self._qvel[ids] = np.where(stopped, 0.0, self._qvel[ids])
 
     def observations(
@@ -86,10 +84,4 @@ class PointMaze(MujocoEnv):
         return np.asarray(np.isfinite(states).all(axis=1))
 
     def valid(self, states: FloatArray) -> BoolArray:
-        return self.healthy(states) & self._maze.is_free(states[:, :2])
-
-    def feasible(self, goals: FloatArray) -> BoolArray:
-        return self._maze.is_free(goals)
-
-    def test_goals(self) -> FloatArray:
-        return self._maze.tiles()
+        return self.healthy(states) & self.maze.is_free(states[:, :2])

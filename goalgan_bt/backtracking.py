@@ -170,9 +170,11 @@ class BacktrackingModel(nn.Module):
         n, steps = data.size, self.cfg.steps
         if not data.enough or steps == 0:
             return {}
-        following = torch.from_numpy(data.next_states[:n])
-        actions = torch.from_numpy(data.actions[:n])
-        deltas = torch.from_numpy(data.states[:n]) - following
+        rows = torch.randint(n, (steps * self.cfg.batch,), generator=self._rng).numpy()
+        following = torch.from_numpy(data.next_states[rows])
+        actions = torch.from_numpy(data.actions[rows])
+        deltas = torch.from_numpy(data.states[rows]) - following
+        # These thousands of rows are sample enough: the whole buffer took longer than the steps.
         for scale, x in (
             (self.state_scale, following),
             (self.action_scale, actions),
@@ -180,11 +182,9 @@ class BacktrackingModel(nn.Module):
         ):
             scale.set(x)
         losses = np.zeros((steps, 2))
-        for i in range(steps):
-            rows = torch.randint(n, (self.cfg.batch,), generator=self._rng)
-            action_nll, state_nll = self.negative_log_likelihood(
-                following[rows], actions[rows], deltas[rows]
-            )
+        batches = (x.split(self.cfg.batch) for x in (following, actions, deltas))
+        for i, batch in enumerate(zip(*batches, strict=True)):
+            action_nll, state_nll = self.negative_log_likelihood(*batch)
             loss = action_nll + state_nll
             self.optimiser.zero_grad(set_to_none=True)
             loss.backward()

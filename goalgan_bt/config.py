@@ -145,7 +145,7 @@ def check(cfg: Config) -> None:
         "policy.init_std policy.final_std policy.min_std policy.hidden value.hidden "
         "value.learning_rate value.epochs value.minibatch gan.learning_rate gan.batch gan.steps "
         "gan.noise_dim gan.pretrain_steps gan.generator_hidden gan.discriminator_hidden "
-        "trpo.max_kl trpo.cg_iters trpo.fisher_fraction trpo.line_search_decay "
+        "trpo.max_kl trpo.final_kl trpo.cg_iters trpo.fisher_fraction trpo.line_search_decay "
         "backtracking.batch backtracking.buffer backtracking.learning_rate backtracking.hidden "
         "backtracking.min_transitions backtracking.max_shift imitation.batch "
         "imitation.learning_rate imitation.max_kl coverage.rollouts coverage.every"

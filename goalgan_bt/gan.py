@@ -30,10 +30,10 @@ class GanConfig:
     """Units of the discriminator's hidden layers (leaky relu 0.1)."""
     learning_rate: float = 1e-3
     """Step size of RMSProp (decay 0.9), both networks."""
-    batch: int = 64
+    batch: int = 256
     """Real goals, and as many generated ones, per step."""
-    steps: int = 200
-    """Training steps per iteration (the original: 250 to 300)."""
+    steps: int = 60
+    """Training steps per iteration (the original: 250 to 300 of a smaller batch)."""
     pretrain_steps: int = 300
     """Training steps on what the fresh policy visits."""
     generator_target: float = 1.0
@@ -58,9 +58,10 @@ class GoalGAN:
         dim = len(low)
         self.generator = mlp((cfg.noise_dim, *cfg.generator_hidden, dim), nn.ReLU)
         self.discriminator = mlp((dim, *cfg.discriminator_hidden, 1), LeakyReLU)
-        # TensorFlow's RMSProp, as the original used it; torch's defaults differ.
+        # RMSProp with the original's decay. Adam without momentum is RMSProp with its start
+        # corrected, and torch has it in one fused call: half the GAN's time went there.
         self.generator_optimiser, self.discriminator_optimiser = (
-            torch.optim.RMSprop(net.parameters(), lr=cfg.learning_rate, alpha=0.9, eps=1e-10)
+            torch.optim.Adam(net.parameters(), lr=cfg.learning_rate, betas=(0.0, 0.9), fused=True)
             for net in (self.generator, self.discriminator)
         )
 
@@ -121,6 +122,10 @@ class LeakyReLU(nn.LeakyReLU):
 
 
 def _descend(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
-    optimiser.zero_grad(set_to_none=True)
-    loss.backward()
+    """One step on the optimiser's own parameters: no gradient for the opposite network."""
+    (group,) = optimiser.param_groups
+    for parameter, gradient in zip(
+        group["params"], torch.autograd.grad(loss, group["params"]), strict=True
+    ):
+        parameter.grad = gradient
     optimiser.step()

@@ -95,7 +95,8 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
         while not last:
             learner.iteration += 1
             metrics: dict[str, float] = {"iteration": learner.iteration}
-            policy.cap_std(finished(cfg, learner, clock.total()))
+            done = finished(cfg, learner, clock.total())
+            policy.cap_std(done)
 
             # Goals: most imagined by the generator, some remembered so that old skills stay.
             imagined = learner.gan.sample(cfg.goals.new)
@@ -110,7 +111,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                 with clock.measure("learning"):
                     # Policy: a trust-region step on what happened.
                     obs = policy.normaliser(flat(rollouts.obs))
-                    metrics |= update_policy(learner, rollouts, obs, cfg)
+                    metrics |= update_policy(learner, rollouts, obs, cfg, done)
 
                     # What the episodes tell: how hard each goal is, what preceded success.
                     learner.remember(episodes)
@@ -222,7 +223,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
 
 
 def update_policy(
-    learner: Learner, rollouts: Rollouts, obs: Tensor, cfg: Config
+    learner: Learner, rollouts: Rollouts, obs: Tensor, cfg: Config, progress: float
 ) -> dict[str, float]:
     """One TRPO step and a fit of the value function on a batch.
 
@@ -231,6 +232,7 @@ def update_policy(
         rollouts: the batch, (T, N, ...).
         obs: (T * N, obs_dim) its normalised observations.
         cfg: settings.
+        progress: of the run, 0 to 1.
     """
     policy, value = learner.policy, learner.value
 
@@ -250,7 +252,7 @@ def update_policy(
         cfg.gae_lambda,
     )
     step = trpo.update(
-        policy, obs, flat(rollouts.actions), flat(advantages), cfg.trpo, learner.noise
+        policy, obs, flat(rollouts.actions), flat(advantages), cfg.trpo, learner.noise, progress
     )
     return group("trpo", step) | group("value", value.fit(obs, flat(returns), learner.noise))
 
