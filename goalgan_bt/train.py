@@ -6,10 +6,21 @@ Florensa et al. 2018, Algorithm 1 (goals, policy update, labels, GAN) with Goyal
 Algorithm 1 inside of it (backtracking model, recall traces, imitation).
 """
 
-import errno
-import math
+import os
 import signal
 import sys
+
+if __name__ == "__main__":
+    # What follows takes seconds to import. Ctrl-C or `kill` meanwhile has nothing to save.
+    def _leave(number: int, _: object) -> None:
+        os.write(2, b"error: interrupted: nothing was saved yet, start again\n")
+        os._exit(130 if number == signal.SIGINT else 2)
+
+    signal.signal(signal.SIGINT, _leave)
+    signal.signal(signal.SIGTERM, _leave)
+
+import errno
+import math
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -251,6 +252,21 @@ def test_interrupted_runs_leave_a_checkpoint_that_resumes(tmp_path, number, code
     resumed = run("--resume", folder, "--iterations", done + 2, out=tmp_path)
     assert resumed.returncode == 0, resumed.stderr
     assert int(columns(tmp_path / folder)[-1]["iteration"]) == done + 2
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="sees torch load in /proc")
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 2)])
+def test_interrupted_while_it_imports_it_says_one_line(number, code):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "goalgan_bt.train"], stderr=subprocess.PIPE, text=True
+    )
+    maps = Path(f"/proc/{process.pid}/maps")
+    while "libtorch" not in maps.read_text():
+        time.sleep(0.01)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert errors == "error: interrupted: nothing was saved yet, start again\n"
 
 
 def test_a_full_disk_is_one_line(tmp_path):
