@@ -65,7 +65,7 @@ def collection(cfg: Config, seconds: float) -> float:
     """Steps/s of rollouts with a fresh policy."""
     env = make_env(cfg, cfg.rollout.num_envs)
     learner = Learner(env, cfg)
-    collector = Collector(env, cfg.rollout, learner.rng, learner.noise)
+    collector = Collector(env, cfg.rollout, learner.rng, learner.noise["rollout"])
     goals = learner.gan.sample(300)
     collector.begin(goals)
     steps, begin = 0, time.perf_counter()

@@ -24,6 +24,15 @@ LEGS = 0.2 * np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])  # (
 # A positive ankle angle lowers the feet 1 and 4 and lifts the feet 2 and 3 (half their length).
 ANKLE_LIFT = 0.2 * np.sqrt(2) * np.array([-1.0, 1.0, 1.0, -1.0])  # m
 
+# The Ant with its legs renumbered by k quarter turns: joint j (hip, ankle, hip, ...) is the old
+# joint JOINT[k, j] times JOINT_SIGN[k, j]. Motors are numbered from leg 4 on.
+_LEG = (np.arange(4) + np.arange(4)[:, None]) % 4  # [k, leg]
+JOINT = np.stack([2 * _LEG, 2 * _LEG + 1], axis=2).reshape(4, 8)
+_SIGN = np.sign(ANKLE_LIFT) * np.sign(ANKLE_LIFT)[_LEG]
+JOINT_SIGN = np.stack([np.ones((4, 4)), _SIGN], axis=2).reshape(4, 8)
+MOTOR = (np.roll(JOINT, 2, axis=1) + 2) % 8
+MOTOR_SIGN = np.roll(JOINT_SIGN, 2, axis=1)
+
 
 def build_model(maze: Maze, integrator: str = "implicitfast") -> mujoco.MjModel:
     """gymnasium's Ant with the original's step, contacts and walls of 1 m."""
@@ -82,8 +91,8 @@ class AntMaze(MazeEnv):
         offset = goals - (self.achieved_goals(states) if achieved is None else achieved)
         offset /= 1.0 + np.linalg.norm(offset, axis=1, keepdims=True)
         states = renumbered(states, quarter_turns(states, goals))
-        along_x, _, along_z = _rotation(states[:, 3:7])
-        front = along_x[:, :2] / (np.linalg.norm(along_x[:, :2], axis=1, keepdims=True) + 1e-9)
+        along_x, _, along_z = axes_on_map(states[:, 3:7])
+        front = along_x / (np.linalg.norm(along_x, axis=1, keepdims=True) + 1e-9)
         velocity = states[:, 15:17]
         obs = np.empty((len(states), self.obs_dim), dtype=np.float32)
         obs[:, :29] = states
@@ -91,7 +100,7 @@ class AntMaze(MazeEnv):
         obs[:, 31:33] = front
         obs[:, 33], obs[:, 34] = _ahead_and_left(offset, front)
         obs[:, 35], obs[:, 36] = _ahead_and_left(velocity, front)
-        obs[:, 37], obs[:, 38] = _ahead_and_left(along_z[:, :2], front)
+        obs[:, 37], obs[:, 38] = _ahead_and_left(along_z, front)
         return obs
 
     def to_body(self, actions: FloatArray, states: FloatArray, goals: FloatArray) -> FloatArray:
@@ -112,9 +121,9 @@ class AntMaze(MazeEnv):
         x = cos @ LEGS[:, 0] - sin @ LEGS[:, 1]
         y = sin @ LEGS[:, 0] + cos @ LEGS[:, 1]
         z = self._foot_share * (np.sin(ankle) @ ANKLE_LIFT)
-        along_x, along_y, along_z = _rotation(states[:, 3:7])
+        along_x, along_y, along_z = axes_on_map(states[:, 3:7])
         com = along_x * x[:, None] + along_y * y[:, None] + along_z * z[:, None]
-        return states[:, :2] + com[:, :2]
+        return states[:, :2] + com
 
     def place(self, states: FloatArray, goals: FloatArray) -> FloatArray:
         moved = states.copy()
@@ -147,15 +156,14 @@ class AntMaze(MazeEnv):
         flat = np.concatenate([LEGS + leg, LEGS + leg + 2 * np.cos(ankle) * leg], axis=1)
         lift = 2 * np.sin(ankle[..., 0]) * ANKLE_LIFT
         height = np.concatenate([np.zeros_like(lift), lift], axis=1)
-        along_x, along_y, along_z = (axis[:, None, :2] for axis in _rotation(states[:, 3:7]))
+        along_x, along_y, along_z = axes_on_map(states[:, 3:7])[:, :, None]
         turned = along_x * flat[..., :1] + along_y * flat[..., 1:] + along_z * height[..., None]
         return states[:, None, :2] + turned
 
 
 def quarter_turns(states: FloatArray, goals: FloatArray) -> NDArray[np.int64]:
     """By how many quarter turns to the left each Ant's front is off its goal, (n,), 0 to 3."""
-    offset, (along_x, _, _) = goals - states[:, :2], _rotation(states[:, 3:7])
-    ahead, left = _ahead_and_left(offset, along_x[:, :2])
+    ahead, left = _ahead_and_left(goals - states[:, :2], axes_on_map(states[:, 3:7])[0])
     turns = np.where(np.abs(ahead) >= np.abs(left), 1 - np.sign(ahead), 2 - np.sign(left))
     return turns.astype(np.int64)
 
@@ -179,29 +187,16 @@ def renumbered(states: FloatArray, turns: NDArray[np.int64]) -> FloatArray:
     out[:, 3:7] *= np.where(out[:, 3:4] < 0, -1.0, 1.0)  # q and -q are the same rotation
     out[:, 18] = cos * states[:, 18] + sin * states[:, 19]  # spin is told in the torso's frame
     out[:, 19] = cos * states[:, 19] - sin * states[:, 18]
-    leg, sign = _leg_order(turns)
     for joints in (slice(7, 15), slice(21, 29)):
-        hips, ankles = states[:, joints][:, 0::2], states[:, joints][:, 1::2]
-        out[:, joints][:, 0::2] = np.take_along_axis(hips, leg, axis=1)
-        out[:, joints][:, 1::2] = np.take_along_axis(ankles, leg, axis=1) * sign
+        moved = np.take_along_axis(states[:, joints], JOINT[turns % 4], axis=1)
+        out[:, joints] = moved * JOINT_SIGN[turns % 4]
     return out
 
 
 def _renumber_actions(actions: FloatArray, turns: NDArray[np.int64]) -> FloatArray:
-    """Torques for legs renumbered as in `renumbered`; the motors begin with leg 4, (n, 8)."""
-    leg, sign = _leg_order(turns)
-    by_leg = np.roll(actions, -2, axis=1)
-    out = np.empty_like(by_leg)
-    out[:, 0::2] = np.take_along_axis(by_leg[:, 0::2], leg, axis=1)
-    out[:, 1::2] = np.take_along_axis(by_leg[:, 1::2], leg, axis=1) * sign
-    return np.roll(out, 2, axis=1)
-
-
-def _leg_order(turns: NDArray[np.int64]) -> tuple[NDArray[np.int64], FloatArray]:
-    """Which leg takes each leg's place, (n, 4), and the sign of its ankle there, (n, 4)."""
-    leg = (np.arange(4) + turns[:, None]) % 4
-    lift = np.sign(ANKLE_LIFT)
-    return leg, lift * lift[leg]
+    """Torques for legs renumbered as in `renumbered`, (n, 8)."""
+    moved = np.take_along_axis(actions, MOTOR[turns % 4], axis=1)
+    return np.asarray(moved * MOTOR_SIGN[turns % 4])
 
 
 def _ahead_and_left(vector: FloatArray, front: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -211,10 +206,15 @@ def _ahead_and_left(vector: FloatArray, front: FloatArray) -> tuple[FloatArray, 
     return ahead, left
 
 
-def _rotation(quaternion: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Where unit quaternions (w, x, y, z), (n, 4), turn the x, y and z axes, each (n, 3)."""
-    w, x, y, z = quaternion.T
-    along_x = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
-    along_y = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=1)
-    along_z = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
-    return along_x, along_y, along_z
+def axes_on_map(quaternion: FloatArray) -> FloatArray:
+    """Where unit quaternions (w, x, y, z), (n, 4), turn the x, y and z axes: the first two
+    components of each, (3, n, 2)."""
+    w, x, y, z = np.ascontiguousarray(quaternion.T)
+    axes = np.empty((3, len(quaternion), 2))
+    axes[0, :, 0] = 1 - 2 * (y * y + z * z)
+    axes[0, :, 1] = 2 * (x * y + w * z)
+    axes[1, :, 0] = 2 * (x * y - w * z)
+    axes[1, :, 1] = 1 - 2 * (x * x + z * z)
+    axes[2, :, 0] = 2 * (x * z + w * y)
+    axes[2, :, 1] = 2 * (y * z - w * x)
+    return axes

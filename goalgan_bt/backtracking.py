@@ -165,10 +165,10 @@ class BacktrackingModel(nn.Module):
 
         Returns:
             action_nll and state_nll, nats per dimension in normalised units (mean over steps);
-            nothing while the buffer is too small.
+            nothing while the buffer is too small, or where no traces are wanted.
         """
         n, steps = data.size, self.cfg.steps
-        if not data.enough or steps == 0:
+        if not data.enough or steps == 0 or self.cfg.trace_length == 0:
             return {}
         rows = torch.randint(n, (steps * self.cfg.batch,), generator=self._rng).numpy()
         following = torch.from_numpy(data.next_states[rows])

@@ -96,9 +96,11 @@ ANT = Config(
     total_steps=12_000_000,
     action_repeat=2,
     discount=0.993,
-    updates=2,
+    updates=4,
     policy=PolicyConfig(init_std=0.2, final_std=0.07),
+    value=ValueConfig(epochs=1, minibatch=1024),
     rollout=RolloutConfig(num_envs=256, steps=50),
+    trpo=TrpoConfig(final_kl=0.005),
     backtracking=BacktrackingConfig(trace_length=50),
     imitation=ImitationConfig(steps=5, learning_rate=1e-5, max_kl=0.0005),
 )

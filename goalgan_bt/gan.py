@@ -34,7 +34,7 @@ class GanConfig:
     """Real goals, and as many generated ones, per step."""
     steps: int = 60
     """Training steps per iteration (the original: 250 to 300 of a smaller batch)."""
-    pretrain_steps: int = 300
+    pretrain_steps: int = 100
     """Training steps on what the fresh policy visits."""
     generator_target: float = 1.0
     """c, what the generator wants D to say: 1 in the original code, 0 in the paper."""

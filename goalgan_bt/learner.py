@@ -16,6 +16,8 @@ from goalgan_bt.imitation import Imitation
 from goalgan_bt.policy import GaussianPolicy, ValueFunction
 from goalgan_bt.rollout import Episodes
 
+NOISY = ("rollout", "trpo", "value", "gan", "backtracking", "imitation")
+
 
 class Learner:
     """The training state, random generators included.
@@ -23,7 +25,7 @@ class Learner:
     Attributes:
         iteration: finished iterations; steps: environment steps by purpose (`train`, `label`,
             `eval`); seconds: wall time so far.
-        rng: numpy's generator; noise: torch's.
+        rng: numpy's generator; noise: torch's, one per part, since parts learn side by side.
         policy, value, gan, estimator, replay, visited, backtracking, transitions, imitation: the
             parts.
     """
@@ -36,19 +38,23 @@ class Learner:
         self.seconds = 0.0
         self.next_coverage = 0
         self.rng = np.random.default_rng(cfg.seed)
-        self.noise = torch.Generator().manual_seed(cfg.seed)
+        seeds = np.random.SeedSequence(cfg.seed).generate_state(len(NOISY)).tolist()
+        self.noise = {
+            part: torch.Generator().manual_seed(seed)
+            for part, seed in zip(NOISY, seeds, strict=True)
+        }
         box = env.goal_low, env.goal_high
         self.policy = GaussianPolicy(env.obs_dim, env.act_dim, cfg.policy)
         self.value = ValueFunction(env.obs_dim, cfg.value)
-        self.gan = GoalGAN(*box, cfg.gan, self.noise)
+        self.gan = GoalGAN(*box, cfg.gan, self.noise["gan"])
         self.estimator = SuccessEstimator(env.goal_dim, cfg.goals)
         self.replay = GoalMemory(env.goal_dim, cfg.goals.replay_distance)
         self.visited = GoalMemory(env.goal_dim, cfg.goals.near / 2)
         self.backtracking = BacktrackingModel(
-            env.state_dim, env.act_dim, cfg.backtracking, self.noise
+            env.state_dim, env.act_dim, cfg.backtracking, self.noise["backtracking"]
         )
         self.transitions = Transitions(env.state_dim, env.act_dim, cfg.backtracking)
-        self.imitation = Imitation(self.policy, cfg.imitation, self.noise)
+        self.imitation = Imitation(self.policy, cfg.imitation, self.noise["imitation"])
 
     def remember(self, episodes: Episodes) -> None:
         """Take in finished episodes: outcomes for the estimator, successes to backtrack from."""
@@ -90,7 +96,7 @@ class Learner:
             "seconds": self.seconds,
             "next_coverage": self.next_coverage,
             "rng": repr(self.rng.bit_generator.state),  # integers too long for a tensor
-            "noise": self.noise.get_state(),
+            "noise": {part: noise.get_state() for part, noise in self.noise.items()},
             "replay": torch.from_numpy(self.replay.goals),
             "visited": torch.from_numpy(self.visited.goals),
             "estimator_goals": torch.from_numpy(self.estimator.goals),
@@ -121,7 +127,8 @@ class Learner:
         self.seconds = float(state["seconds"])
         self.next_coverage = int(state["next_coverage"])
         self.rng.bit_generator.state = ast.literal_eval(state["rng"])
-        self.noise.set_state(state["noise"])
+        for part, noise in self.noise.items():
+            noise.set_state(state["noise"][part])
         self.replay.goals = state["replay"].numpy().copy()
         self.visited.goals = state["visited"].numpy().copy()
         self.estimator.goals = state["estimator_goals"].numpy().copy()

@@ -23,6 +23,7 @@ import errno
 import math
 import time
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -43,7 +44,7 @@ from goalgan_bt.envs.maze import MapError
 from goalgan_bt.learner import Learner
 from goalgan_bt.progress import Progress, complain, say
 from goalgan_bt.record import Record
-from goalgan_bt.rollout import Collector, Rollouts
+from goalgan_bt.rollout import Collector, Float32, Rollouts
 
 TEST_ENVS = 512  # simulations side by side when coverage is measured
 FRAME_TRACES = 64  # traces kept in a frame
@@ -78,7 +79,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
             )
     config.save(cfg, folder)
     policy, rng, noise = learner.policy, learner.rng, learner.noise
-    collector = Collector(env, cfg.rollout, rng, noise)
+    collector = Collector(env, cfg.rollout, rng, noise["rollout"])
     test_goals = env.test_goals()
     records = Record(folder, learner.iteration)
     clock = Clock(learner.seconds)
@@ -101,7 +102,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
     else:
         collector.begin(learner.gan.sample(cfg.goals.new))
 
-    with Progress(f"{env.name}, seed {cfg.seed}") as progress:
+    with Progress(f"{env.name}, seed {cfg.seed}") as progress, ThreadPoolExecutor(1) as beside:
         last = False
         while not last:
             learner.iteration += 1
@@ -120,21 +121,31 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                 learner.steps["train"] += rollouts.rewards.size * cfg.action_repeat
 
                 with clock.measure("learning"):
-                    # Policy: a trust-region step on what happened.
+                    # Policy: a trust-region step on what happened. The value function and the
+                    # backtracking model (what preceded success) share nothing with it, and so
+                    # they learn beside it, on the second core.
                     obs = policy.normaliser(flat(rollouts.obs))
-                    metrics |= update_policy(learner, rollouts, obs, cfg, done)
-
-                    # What the episodes tell: how hard each goal is, what preceded success.
                     learner.remember(episodes)
-                    if cfg.backtracking.trace_length:
-                        losses = learner.backtracking.fit(learner.transitions)
-                        metrics |= group("backtracking", losses)
+                    advantages, returns = advantages_and_returns(learner, rollouts, obs, cfg)
+                    value_fit = beside.submit(learner.value.fit, obs, flat(returns), noise["value"])
+                    model_fit = beside.submit(learner.backtracking.fit, learner.transitions)
+                    step = trpo.update(
+                        policy,
+                        obs,
+                        flat(rollouts.actions),
+                        flat(advantages),
+                        cfg.trpo,
+                        noise["trpo"],
+                        done,
+                    )
+                    metrics |= group("trpo", step) | group("value", value_fit.result())
+                    metrics |= group("backtracking", model_fit.result())
 
             # Labels: goals neither hopeless nor mastered teach the generator what to propose next.
             if cfg.goals.label_rollouts:
                 with clock.measure("label"):
                     success, steps = success_rate(
-                        test_env, policy, goals, cfg.goals.label_rollouts, noise
+                        test_env, policy, goals, cfg.goals.label_rollouts, noise["rollout"]
                     )
                 learner.steps["label"] += steps
             else:
@@ -146,10 +157,11 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                 # The estimator's labels are free: the GAN also learns from goals that nobody tried.
                 others = rng.uniform(env.goal_low, env.goal_high, (extra, env.goal_dim))
                 other_labels = learner.intermediate(others, learner.estimator(others))
-                losses = learner.gan.fit(
-                    np.concatenate([goals, others]), np.concatenate([labels, other_labels])
+                gan_fit = beside.submit(
+                    learner.gan.fit,
+                    np.concatenate([goals, others]),
+                    np.concatenate([labels, other_labels]),
                 )
-                metrics |= group("gan", losses)
 
                 # Recall traces: imagine more ways of getting to those goals, and imitate them.
                 seeds = decode(
@@ -173,6 +185,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                         policy.normaliser(trace_obs), trace_actions, reference
                     ),
                 )
+                metrics |= group("gan", gan_fit.result())
                 # Only now: the policy must not change under data that it made. The last batch
                 # stands for all of the iteration's.
                 policy.normaliser.update(flat(rollouts.obs))
@@ -186,7 +199,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
             if measure:
                 with clock.measure("evaluation"):
                     measured, steps = success_rate(
-                        test_env, policy, test_goals, cfg.coverage.rollouts, noise
+                        test_env, policy, test_goals, cfg.coverage.rollouts, noise["rollout"]
                     )
                     by_mean, mean_steps = success_rate(test_env, policy, test_goals, 1, None)
                 learner.steps["eval"] += steps + mean_steps
@@ -233,27 +246,26 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
     return Trained(coverage, learner.steps["train"])
 
 
-def update_policy(
-    learner: Learner, rollouts: Rollouts, obs: Tensor, cfg: Config, progress: float
-) -> dict[str, float]:
-    """One TRPO step and a fit of the value function on a batch.
+def advantages_and_returns(
+    learner: Learner, rollouts: Rollouts, obs: Tensor, cfg: Config
+) -> tuple[Float32, Float32]:
+    """Generalised advantages and what the value function shall predict, each (T, N).
 
     Args:
-        learner: whose policy and value function learn.
+        learner: whose value function judges.
         rollouts: the batch, (T, N, ...).
         obs: (T * N, obs_dim) its normalised observations.
         cfg: settings.
-        progress: of the run, 0 to 1.
     """
     policy, value = learner.policy, learner.value
 
     @torch.no_grad()
-    def values_of(raw: np.ndarray) -> np.ndarray:
+    def values_of(raw: Float32) -> Float32:
         return value(policy.normaliser(torch.from_numpy(raw))).numpy()
 
     with torch.no_grad():
         values = value(obs).view(rollouts.rewards.shape).numpy()
-    advantages, returns = gae(
+    return gae(
         rollouts.rewards,
         values,
         rollouts.next_values(values, values_of),
@@ -262,10 +274,6 @@ def update_policy(
         cfg.discount,
         cfg.gae_lambda,
     )
-    step = trpo.update(
-        policy, obs, flat(rollouts.actions), flat(advantages), cfg.trpo, learner.noise, progress
-    )
-    return group("trpo", step) | group("value", value.fit(obs, flat(returns), learner.noise))
 
 
 def flat(array: np.ndarray) -> Tensor:
