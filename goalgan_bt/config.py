@@ -107,15 +107,16 @@ ANT = Config(
 POINT = Config(
     env="point_umaze",
     total_steps=4_000_000,
-    action_repeat=2,
-    discount=0.985,
-    updates=2,
-    policy=PolicyConfig(init_std=1.0),
-    value=ValueConfig(minibatch=1024),
-    rollout=RolloutConfig(num_envs=256, steps=40),
-    trpo=TrpoConfig(max_kl=0.05),
-    coverage=CoverageConfig(rollouts=2, every=250_000),
+    action_repeat=4,
+    discount=0.97,
+    updates=8,
+    policy=PolicyConfig(init_std=1.0, final_std=0.3),
+    value=ValueConfig(minibatch=128),
+    rollout=RolloutConfig(num_envs=32, steps=40),
+    trpo=TrpoConfig(max_kl=0.015),
     backtracking=BacktrackingConfig(trace_length=20),
+    imitation=ImitationConfig(max_kl=0.02),
+    coverage=CoverageConfig(rollouts=2, every=250_000),
 )
 
 
