@@ -21,6 +21,7 @@ class Step(NamedTuple):
 
     states: (n, state_dim) afterwards; obs: (n, obs_dim) float32, those states as the policy sees
     them.
+    achieved: (n, goal_dim) the goals on which they stand.
     actions: (n, act_dim) what the body felt, in [-1, 1] (see `GoalEnv.to_body`).
     rewards: (n,) float32, 1 on reaching the goal, else 0.
     terminated: (n,) bool, the goal was reached or the body failed (an Ant that fell).
@@ -29,6 +30,7 @@ class Step(NamedTuple):
 
     states: FloatArray
     obs: NDArray[np.float32]
+    achieved: FloatArray
     actions: FloatArray
     rewards: NDArray[np.float32]
     terminated: BoolArray
@@ -195,7 +197,8 @@ class GoalEnv:
             obs = self.observations(states, goals, achieved)
         terminated = success | ~healthy
         truncated = ~terminated & (self.elapsed[ids] >= self.horizon)
-        return Step(states, obs, actions, success.astype(np.float32), terminated, truncated)
+        rewards = success.astype(np.float32)
+        return Step(states, obs, achieved, actions, rewards, terminated, truncated)
 
 
 class MujocoEnv(GoalEnv):

@@ -113,7 +113,7 @@ POINT = Config(
     policy=PolicyConfig(init_std=1.0, final_std=0.3),
     value=ValueConfig(minibatch=128),
     rollout=RolloutConfig(num_envs=32, steps=40),
-    trpo=TrpoConfig(max_kl=0.015),
+    trpo=TrpoConfig(max_kl=0.007),
     backtracking=BacktrackingConfig(trace_length=20),
     imitation=ImitationConfig(max_kl=0.02),
     coverage=CoverageConfig(rollouts=2, every=250_000),

@@ -40,7 +40,8 @@ class Rollouts:
 
     obs: (T, N, obs_dim); actions: (T, N, act_dim) as sampled; rewards, terminated, truncated:
     (T, N); last_obs: (N, obs_dim) what followed the last step; truncated_obs: (K, obs_dim) what
-    followed each truncated step, in the order of np.nonzero(truncated).
+    followed each truncated step, in the order of np.nonzero(truncated); achieved: (T, N, goal_dim)
+    the goal on which each step ended.
     """
 
     obs: Float32
@@ -50,6 +51,12 @@ class Rollouts:
     truncated: BoolArray
     last_obs: Float32
     truncated_obs: Float32
+    achieved: Float32
+
+    def paths(self, n: int) -> Float32:
+        """Where the first n simulations went, (T, n, goal_dim), NaN where an episode ended."""
+        ended = (self.terminated | self.truncated)[:, :n, None]
+        return np.where(ended, np.float32(np.nan), self.achieved[:, :n])
 
     def next_values(self, values: Float32, value: Callable[[Float32], Float32]) -> Float32:
         """V of the state that followed each step, (T, N), given V of `obs`, (T, N)."""
@@ -108,6 +115,7 @@ class Collector:
         self._obs = np.zeros((*shape, env.obs_dim), dtype=np.float32)
         self._sampled = np.zeros((*shape, env.act_dim), dtype=np.float32)
         self._rewards = np.zeros(shape, dtype=np.float32)
+        self._achieved = np.zeros((*shape, env.goal_dim), dtype=np.float32)
         self._terminated = np.zeros(shape, dtype=bool)
         self._truncated = np.zeros(shape, dtype=bool)
 
@@ -132,7 +140,7 @@ class Collector:
             self._actions[self._age, ids] = step.actions
             self._age += 1
             self._states[self._age, ids] = step.states
-            self._rewards[t] = step.rewards
+            self._rewards[t], self._achieved[t] = step.rewards, step.achieved
             self._terminated[t], self._truncated[t] = step.terminated, step.truncated
 
             done = np.flatnonzero(step.terminated | step.truncated)
@@ -160,6 +168,7 @@ class Collector:
             self._truncated,
             obs,
             np.concatenate([np.empty((0, env.obs_dim), np.float32), *truncated_obs]),
+            self._achieved,
         )
         return rollouts, self._episodes(ended, successes)
 

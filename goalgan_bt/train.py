@@ -48,6 +48,7 @@ from goalgan_bt.rollout import Collector, Float32, Rollouts
 
 TEST_ENVS = 512  # simulations side by side when coverage is measured
 FRAME_TRACES = 64  # traces kept in a frame
+FRAME_PATHS = 32  # simulations whose paths are kept in a frame
 SEED_STATES = 4000  # experienced states among which the decoder looks
 KL_SAMPLE = 2048  # observations on which imitation's KL is bounded
 
@@ -235,6 +236,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                     replay=learner.replay.goals,
                     traces=traces.paths(env)[:, :FRAME_TRACES],
                     trace_goals=traces.goals[:FRAME_TRACES],
+                    paths=rollouts.paths(FRAME_PATHS),
                     test_goals=test_goals,
                     estimate=estimate,
                     coverage=measured,

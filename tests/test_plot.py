@@ -24,7 +24,7 @@ def plot(*arguments):
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "point_umaze-test-s0"
     folder.mkdir()
-    flags = "--env point_umaze --iterations 3 --rollout.num-envs 16 --rollout.steps 20 --horizon 30"
+    flags = "--env point_umaze --iterations 3 --rollout.num-envs 16 --rollout.steps 20 --horizon 40"
     cfg = config.from_command_line([*flags.split(), "--threads", "1"])
     record.write_meta(folder, mazes.layout("umaze"))
     train(cfg, folder)

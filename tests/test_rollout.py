@@ -123,3 +123,15 @@ def test_same_seed_same_rollouts():
         results.append(rollouts.obs.copy())
     assert np.array_equal(results[0], results[1])
     assert not np.array_equal(results[0], results[2])
+
+
+def test_paths_follow_the_body_and_break_where_an_episode_ends():
+    env, policy, collector = make(horizon=10, steps=25)
+    collector.begin(np.full((1, 2), 100.0))  # out of reach: episodes end by time alone
+    rollouts, _ = collector.collect(policy, np.full((1, 2), 100.0))
+    paths = rollouts.paths(3)
+    ended = np.isnan(paths).any(axis=2)
+    assert paths.shape == (25, 3, 2)
+    assert (np.flatnonzero(ended[:, 0]) == [9, 19]).all()
+    assert np.allclose(paths[:9, 0], rollouts.obs[1:10, 0, :2], atol=1e-6)
+    assert np.allclose(paths[-1, 0], env.read_states(np.arange(3))[0, :2], atol=1e-6)
