@@ -6,6 +6,7 @@ runs/<env>-<time>-s<seed>/
     metrics.csv       a row per iteration; columns may be added while it grows
     frames/000010.npz a report: goals, labels, replay, traces, coverage (see `Record.frame`)
     checkpoint.pt     the whole training state (see `goalgan_bt.checkpoint`)
+    ended.txt         how the run ended; absent while it goes on, or where it was killed
     events.*          TensorBoard, if it is installed (extra `tensorboard`)
 """
 
@@ -18,6 +19,7 @@ import subprocess
 import sys
 import time
 import zipfile
+import zlib
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,7 @@ import numpy as np
 
 from goalgan_bt.envs.maze import Maze
 
+ENDED = "ended.txt"
 PACKAGES = ("goalgan_bt", "mujoco", "numpy", "torch", "gymnasium", "gymnasium-robotics", "tyro")
 
 
@@ -89,6 +92,7 @@ class Record:
         self._rows: list[dict[str, str]] = []
         self._columns: list[str] = []
         (folder / "frames").mkdir(exist_ok=True)
+        (folder / ENDED).unlink(missing_ok=True)
         if (folder / "metrics.csv").exists():
             self._columns, rows = read_metrics(folder)
             self._rows = [row for row in rows if int(row["iteration"]) <= iteration]
@@ -130,8 +134,9 @@ class Record:
         path = self.folder / "frames" / f"{iteration:06d}.npz"
         write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
 
-    def close(self) -> None:
-        """Flush what TensorBoard buffers."""
+    def close(self, how: str) -> None:
+        """Say how the run ended, and flush what TensorBoard buffers."""
+        (self.folder / ENDED).write_text(how + "\n")
         if self._events is not None:
             self._events.close()
 
@@ -210,7 +215,7 @@ def read_frame(path: Path) -> dict[str, np.ndarray[Any, Any]]:
     try:
         with np.load(path, allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise RunError(f"cannot read the frame {path}: {error}") from None
     if "coverage" not in arrays:
         raise RunError(f"{path} is no frame of a run")

@@ -244,7 +244,8 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
             if measure:
                 learner.seconds = clock.total()
                 checkpoint.save(learner, folder)
-    records.close()
+    complete = finished(cfg, learner, clock.total()) >= 1
+    records.close("complete" if complete else "stopped early: --resume goes on")
     return Trained(coverage, learner.steps["train"])
 
 

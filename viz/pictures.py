@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from goalgan_bt import record
-from goalgan_bt.envs.maze import MapError, Maze
+from goalgan_bt.viz.run import maze_of
 
 # Red (never reached) over pale yellow to blue (mastered): readable for colour-blind people.
 COLOURS = "RdYlBu"
@@ -26,19 +26,6 @@ PUBLISHED = {
         ("+ recall traces (published)", [(0.5e6, 0.30), (3e6, 0.78), (4e6, 0.96)]),
     ],
 }
-
-
-def maze_of(folder: Path) -> Maze | None:
-    """The maze of a run, or None for an environment without walls.
-
-    Raises:
-        RunError: if the folder is no run.
-    """
-    try:
-        maze = record.read_meta(folder)["maze"]
-        return None if maze is None else Maze(tuple(maze["rows"]), maze["cell_size"])
-    except (KeyError, TypeError, MapError) as error:
-        raise record.RunError(f"{folder / 'meta.json'} is damaged: {error!r}") from None
 
 
 def coverage_curve(ax: Axes, folders: list[Path]) -> None:

@@ -1,0 +1,91 @@
+"""Open a page over run folders: `python -m goalgan_bt.viz RUN [RUN ...]`."""
+
+import contextlib
+import io
+import signal
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+import tyro
+
+from goalgan_bt.progress import complain, say
+from goalgan_bt.record import RunError
+
+
+@dataclass(frozen=True)
+class ViewConfig:
+    """Watch runs in a browser, live or afterwards; nothing in the folders is changed."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folders: one in full, or several side by side."""
+    host: str = "127.0.0.1"
+    """Where to listen; 0.0.0.0 lets everybody on the network in, without a password."""
+    port: int = 8080
+    """Port; if it is busy, the next free one is taken and printed. 0 takes any."""
+    with_parent: bool = False
+    """End when standard input closes: for a page that another program starts."""
+
+
+def main() -> int:
+    """The command line; returns the exit code."""
+    try:
+        cfg = from_command_line()
+        # Only now: this imports torch and MuJoCo, and --help shall not wait for them.
+        from goalgan_bt.viz.view import View, open_runs
+
+        view = View(open_runs(list(cfg.runs)), cfg.host, cfg.port)
+        port = view.server.get_port()
+        if cfg.port not in (0, port):
+            complain(f"port {cfg.port} is busy: took {port} instead")
+        if cfg.host in ("0.0.0.0", "::"):
+            complain("everybody who can reach this machine can use the page: there is no password")
+        say(f"view: {view.address}")
+        signal.signal(signal.SIGTERM, _leave)
+        if cfg.with_parent:
+            threading.Thread(target=_wait_for_parent, daemon=True).start()
+        view.spin()
+    except KeyboardInterrupt:
+        return 130
+    except (RunError, ValueError, OSError) as error:
+        complain(str(error))
+        return 2
+    return 0
+
+
+def from_command_line(argv: list[str] | None = None) -> ViewConfig:
+    """What the command line asks for.
+
+    Raises:
+        ValueError: if it makes no sense.
+        SystemExit: after `--help`.
+    """
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+            cfg = tyro.cli(ViewConfig, args=argv, prog="python -m goalgan_bt.viz")
+    except SystemExit as stop:
+        if not stop.code:
+            sys.stdout.write(printed.getvalue())
+            raise
+        raise ValueError("what to show? python -m goalgan_bt.viz RUN; --help tells more") from None
+    if not cfg.runs:
+        raise ValueError("name at least one run folder: python -m goalgan_bt.viz RUN")
+    if not 0 <= cfg.port <= 65535:
+        raise ValueError(f"--port must be between 0 and 65535, not {cfg.port}")
+    return cfg
+
+
+def _leave(number: int, _: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def _wait_for_parent() -> None:
+    sys.stdin.read()
+    signal.raise_signal(signal.SIGTERM)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

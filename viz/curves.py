@@ -1,0 +1,151 @@
+"""The curves of the panel, drawn by uPlot in the browser."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import viser
+from viser import uplot
+
+from goalgan_bt.envs.maze import FloatArray
+from goalgan_bt.viz.run import Run
+
+MOST = 400  # points of a curve that are sent to the page
+COLOURS = ("#3b7dd8", "#e8871e", "#4aa564", "#c2416b", "#8a63c9", "#7a7a7a")
+# The coverage that was published last for each environment (Goyal et al. 2019, figures 5 and 6).
+PUBLISHED = {
+    "ant_umaze": (("Goal GAN, 137M steps", 0.63), ("recall traces, 77M steps", 0.64)),
+    "point_umaze": (("Goal GAN, 6M steps", 0.78), ("recall traces, 4M steps", 0.96)),
+}
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A title and the metrics in it: (column of `metrics.csv`, name of the curve)."""
+
+    title: str
+    curves: tuple[tuple[str, str], ...]
+
+
+PLOTS = (
+    Plot(
+        "Coverage",
+        (
+            ("eval/coverage", "measured"),
+            ("eval/coverage_deterministic", "deterministic"),
+            ("curriculum/estimated_coverage", "estimated"),
+        ),
+    ),
+    Plot(
+        "Goals and success",
+        (
+            ("curriculum/intermediate", "intermediate"),
+            ("curriculum/too_easy", "too easy"),
+            ("rollout/success", "success"),
+        ),
+    ),
+    Plot("KL of a step, nats", (("trpo/kl", "TRPO"), ("imitation/kl", "imitation"))),
+    Plot(
+        "Losses",
+        (
+            ("gan/discriminator_loss", "discriminator"),
+            ("gan/generator_loss", "generator"),
+            ("backtracking/action_nll", "q(a | s')"),
+            ("backtracking/state_nll", "q(ds | a, s')"),
+        ),
+    ),
+    Plot("Imitation loss, nats", (("imitation/loss", "-log pi(a | s, g)"),)),
+    Plot("Environment steps per second", (("time/fps", "training"),)),
+)
+
+
+def thinned(n: int) -> np.ndarray:
+    """At most `MOST` of n rows, evenly spread, the last one always among them."""
+    return np.unique(np.linspace(0, n - 1, min(n, MOST)).round().astype(int))
+
+
+def joined(x: FloatArray, y: FloatArray) -> FloatArray:
+    """y with the gaps between known values joined by lines; NaN outside of them."""
+    known = np.isfinite(y)
+    if not known.any():
+        return y
+    filled = np.interp(x, x[known], y[known])
+    first, last = np.flatnonzero(known)[[0, -1]]
+    filled[:first], filled[last + 1 :] = np.nan, np.nan
+    return filled
+
+
+def series(run: Run, plot: Plot) -> tuple[FloatArray, ...]:
+    """Million steps and every curve of a plot, each (n,)."""
+    if not run.rows:
+        return tuple(np.zeros((1 + len(plot.curves), 1)))
+    steps = run.column("steps/train") / 1e6
+    rows = thinned(len(steps))
+    return (steps[rows], *(joined(steps, run.column(name))[rows] for name, _ in plot.curves))
+
+
+class Curves:
+    """The plots of one run, or one plot with the coverage of several.
+
+    Args:
+        gui: where they go.
+        runs: one or more.
+    """
+
+    def __init__(self, gui: viser.GuiApi, runs: list[Run]) -> None:
+        self._runs = runs
+        self._handles: list[Any] = []
+        if len(runs) > 1:
+            names = [run.name for run in runs]
+            self._handles.append(_add(gui, "Coverage", self._compared(), names))
+        else:
+            self._published = PUBLISHED.get(runs[0].env, ())
+            for plot in PLOTS:
+                names = [name for _, name in plot.curves]
+                extra = [name for name, _ in self._published] if plot is PLOTS[0] else []
+                self._handles.append(_add(gui, plot.title, self._data(plot), names, extra))
+
+    def refresh(self) -> None:
+        """Send what is new to the page."""
+        if len(self._runs) > 1:
+            self._handles[0].data = self._compared()
+        else:
+            for plot, handle in zip(PLOTS, self._handles, strict=True):
+                handle.data = self._data(plot)
+
+    def _data(self, plot: Plot) -> tuple[FloatArray, ...]:
+        data = series(self._runs[0], plot)
+        if plot is PLOTS[0]:
+            data += tuple(np.full(len(data[0]), level) for _, level in self._published)
+        return data
+
+    def _compared(self) -> tuple[FloatArray, ...]:
+        own = [series(run, PLOTS[0])[:2] for run in self._runs]
+        longest = max((steps for steps, _ in own), key=lambda steps: steps[-1])
+        return (longest, *(np.interp(longest, x, y, right=np.nan) for x, y in own))
+
+
+def _add(
+    gui: viser.GuiApi,
+    title: str,
+    data: tuple[FloatArray, ...],
+    names: list[str],
+    references: list[str] | None = None,
+) -> viser.GuiUplotHandle:
+    lines = [
+        uplot.Series(label=name, stroke=COLOURS[i % len(COLOURS)], width=2, spanGaps=True)
+        for i, name in enumerate(names)
+    ]
+    lines += [
+        uplot.Series(label=name, stroke="#999999", width=1, dash=(4, 4 + 4 * i))
+        for i, name in enumerate(references or [])
+    ]
+    return gui.add_uplot(
+        data,
+        (uplot.Series(label="million steps"), *lines),
+        title=title,
+        scales={"x": uplot.Scale(time=False)},
+        axes=(uplot.Axis(stroke="#888888"), uplot.Axis(stroke="#888888", size=45)),
+        legend=uplot.Legend(show=True),
+        aspect=1.6,
+    )

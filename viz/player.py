@@ -1,0 +1,109 @@
+"""Episodes of a run's newest policy, in simulations of the view's own."""
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+
+from goalgan_bt import checkpoint, config
+from goalgan_bt.envs.batch import MujocoEnv
+from goalgan_bt.envs.maze import BoolArray, FloatArray
+from goalgan_bt.learner import Learner
+from goalgan_bt.record import RunError
+from goalgan_bt.train import make_env
+
+MOST = 128  # goals tried at once
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """Episodes side by side.
+
+    goals: (n, goal_dim); states: (T + 1, n, state_dim), each held still after its end;
+    ends: (n,) the action after which each ended; reached: (n,); dt: seconds between two states.
+    """
+
+    goals: FloatArray
+    states: FloatArray
+    ends: np.ndarray
+    reached: BoolArray
+    dt: float
+
+    @property
+    def seconds(self) -> float:
+        """How long the longest episode took."""
+        return float(self.ends.max() * self.dt)
+
+
+class Player:
+    """Plays the policy of a run's checkpoint, which it takes up anew whenever it changes.
+
+    Args:
+        folder: the run folder.
+        seed: of the goals that it picks by itself and of the policy's noise.
+
+    Raises:
+        ConfigError: if the run's settings cannot be read.
+    """
+
+    def __init__(self, folder: Path, seed: int = 0) -> None:
+        torch.set_num_threads(1)  # the trainer needs the cores
+        self._folder = folder
+        cfg = replace(config.load(folder), threads=1)
+        self.env = make_env(cfg, MOST)
+        self._learner = Learner(self.env, replace(cfg, rollout=cfg.rollout))
+        self._stamp: int | None = None
+        self.rng = np.random.default_rng(seed)
+
+    @property
+    def model(self) -> mujoco.MjModel | None:
+        """The MuJoCo model, or None for the N-dimensional point mass."""
+        return self.env.model if isinstance(self.env, MujocoEnv) else None
+
+    @property
+    def iteration(self) -> int:
+        """Of the policy, 0 while there is none."""
+        return 0 if self._stamp is None else self._learner.iteration
+
+    def take_newest(self) -> bool:
+        """Load the checkpoint if it is new and whole; whether there is a policy to play."""
+        path = self._folder / "checkpoint.pt"
+        try:
+            stamp = os.stat(path).st_mtime_ns
+            if stamp != self._stamp:
+                checkpoint.load(self._learner, self._folder)
+                self._stamp = stamp
+        except (OSError, RunError):
+            pass  # none yet, or another version: the last one will do
+        return self._stamp is not None
+
+    def attempt(self, goals: FloatArray) -> Attempt:
+        """Try each goal once from the start with the stochastic policy.
+
+        Args:
+            goals: (n, goal_dim) metres, at most `MOST` of them.
+        """
+        env, policy, n = self.env, self._learner.policy, len(goals)
+        noise = torch.Generator().manual_seed(int(self.rng.integers(2**31)))
+        active = np.arange(n)
+        env.reset(active, goals)
+        obs = env.observe(active)
+        states = [env.read_states(np.arange(n))]
+        reached, ends = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
+        while len(active):
+            step = env.step(active, policy.act(obs, noise))
+            latest = states[-1].copy()
+            latest[active] = step.states
+            states.append(latest)
+            ends[active] = len(states) - 1
+            reached[active] = step.rewards > 0
+            going = ~(step.terminated | step.truncated)
+            active, obs = active[going], step.obs[going]
+        return Attempt(goals, np.array(states), ends, reached, env.dt * env.action_repeat)
+
+    def some_goal(self) -> FloatArray:
+        """A feasible goal at random, (1, goal_dim)."""
+        return self.rng.choice(self.env.test_goals(), size=1)

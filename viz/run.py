@@ -1,0 +1,136 @@
+"""A run folder as the view sees it: whatever is there by now, and never an error for what is not.
+
+A run may be live (files grow and appear while they are read), finished, of another version, gone.
+"""
+
+import json
+import math
+import time
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from goalgan_bt import record
+from goalgan_bt.envs.maze import FloatArray, MapError, Maze
+
+Frame = dict[str, NDArray[Any]]
+REMEMBERED = 64  # frames kept in memory
+
+
+def maze_of(folder: Path) -> Maze | None:
+    """The maze of a run, or None for an environment without walls.
+
+    Raises:
+        RunError: if the folder is no run.
+    """
+    try:
+        maze = record.read_meta(folder)["maze"]
+        return None if maze is None else Maze(tuple(maze["rows"]), maze["cell_size"])
+    except (KeyError, TypeError, MapError) as error:
+        raise record.RunError(f"{folder / 'meta.json'} is damaged: {error!r}") from None
+
+
+class Run:
+    """What is known of a run.
+
+    Args:
+        folder: the run folder.
+
+    Attributes:
+        name, env, maze: from the folder; maze is None where there are no walls.
+        settings: the resolved settings as nested dictionaries.
+        iterations: of the frames there are, ascending.
+        rows: of `metrics.csv`, as text.
+        gone: whether the folder has vanished; what was read of it stays.
+
+    Raises:
+        RunError: if the folder is no run.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.name = folder, folder.name
+        self.maze = maze_of(folder)
+        try:
+            settings = json.loads((folder / "config.json").read_text())
+            self.env, self.settings = str(settings["env"]), dict(settings)
+        except (OSError, ValueError, KeyError, TypeError):
+            raise record.RunError(f"{folder} is no run: it has no readable config.json") from None
+        self.iterations: list[int] = []
+        self.rows: list[dict[str, str]] = []
+        self.gone = False
+        self._stamp: tuple[int, int] | None = None
+        self._frames: OrderedDict[int, tuple[int, Frame]] = OrderedDict()
+        self.refresh()
+
+    def refresh(self) -> bool:
+        """Look at the folder again; whether there is anything new in it."""
+        self.gone = not self.folder.is_dir()
+        if self.gone:
+            return False
+        iterations = [int(path.stem) for path in record.frames(self.folder)]
+        new_frames, self.iterations = iterations != self.iterations, iterations
+        try:
+            status = (self.folder / "metrics.csv").stat()
+            stamp = (status.st_mtime_ns, status.st_size)
+            new_rows = stamp != self._stamp
+            if new_rows:
+                self.rows, self._stamp = record.read_metrics(self.folder)[1], stamp
+        except (OSError, record.RunError):  # being replaced, or damaged: the old rows will do
+            new_rows = False
+        return new_frames or new_rows
+
+    def frame(self, iteration: int) -> Frame | None:
+        """The frame of that iteration, or None if it cannot be read."""
+        path = self.folder / "frames" / f"{iteration:06d}.npz"
+        try:
+            stamp = path.stat().st_mtime_ns  # a resumed run may write a frame anew
+            known = self._frames.get(iteration)
+            if known is None or known[0] != stamp:
+                self._frames[iteration] = stamp, record.read_frame(path)
+        except (OSError, record.RunError):
+            return self._frames[iteration][1] if iteration in self._frames else None
+        self._frames.move_to_end(iteration)
+        while len(self._frames) > REMEMBERED:
+            self._frames.popitem(last=False)
+        return self._frames[iteration][1]
+
+    def ended(self) -> str | None:
+        """How the run ended, or None while it goes on (or was killed without a word)."""
+        try:
+            return (self.folder / record.ENDED).read_text()[:200].strip()
+        except (OSError, UnicodeDecodeError):
+            return None
+
+    def age(self) -> float:
+        """Seconds since the metrics last changed."""
+        return math.inf if self._stamp is None else time.time() - self._stamp[0] / 1e9
+
+    def column(self, name: str) -> FloatArray:
+        """A metric over the rows, (n,), NaN where it is missing or no number."""
+        return np.array([number(row.get(name)) for row in self.rows])
+
+    def row_of(self, iteration: int) -> dict[str, str]:
+        """The metrics of an iteration; empty if there are none."""
+        for row in reversed(self.rows):
+            if row.get("iteration") == str(iteration):
+                return row
+        return {}
+
+
+def number(text: str | None) -> float:
+    """A cell of `metrics.csv` as a number, NaN if it is none."""
+    try:
+        return float(text) if text else math.nan
+    except ValueError:
+        return math.nan
+
+
+def success(frame: Frame) -> tuple[FloatArray, bool]:
+    """Success per test goal, (K,): measured, and True, or the learner's estimate, and False."""
+    measured = np.asarray(frame["coverage"], dtype=float)
+    if len(measured) and np.isfinite(measured).all():
+        return measured, True
+    return np.asarray(frame.get("estimate", measured), dtype=float), False

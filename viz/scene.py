@@ -1,0 +1,280 @@
+"""The 3D scene: the maze, the coverage map on its floor, goals, recall traces, paths.
+
+Each layer is one node that is replaced in place; a frame of a run fills them all.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from goalgan_bt.envs.maze import FloatArray, Maze
+from goalgan_bt.viz.run import Frame, success
+
+# Red (never reached) over pale yellow to blue (mastered): ColorBrewer's RdYlBu, made to be told
+# apart by colour-blind people.
+STOPS = np.array(
+    [[165, 0, 38], [244, 109, 67], [254, 224, 144], [171, 217, 233], [69, 117, 180], [49, 54, 149]]
+)
+TOO_HARD, INTERMEDIATE, TOO_EASY, REPLAYED = (
+    (214, 39, 40),
+    (255, 255, 255),
+    (31, 119, 180),
+    (120, 120, 120),
+)
+TRACE, PATH, MARK = (255, 140, 0), (90, 90, 100), (255, 0, 170)
+WALL, START = (120, 126, 135), (255, 255, 255)
+PIXELS = 16  # per tile of the coverage map
+WALL_HEIGHT = 0.35  # metres: low, so that no wall hides the map
+
+# name: (label in the panel, what one is looking at, shown at first)
+LAYERS = {
+    "coverage": (
+        "Coverage map",
+        "The floor: how often the policy reaches each 0.5 m tile from the start. Measured where "
+        "the caption says so, otherwise the learner's own estimate from its recent episodes.",
+        True,
+    ),
+    "goals": (
+        "Goals",
+        "What the policy trains on now: imagined by the GAN, white of intermediate difficulty, "
+        "blue too easy, red too hard; remembered ones are smaller.",
+        True,
+    ),
+    "traces": (
+        "Recall traces",
+        "Imagined by the backtracking model: bright at the goal, fading backward in time.",
+        True,
+    ),
+    "paths": ("Paths", "Where some of the last training episodes went.", False),
+    "replay": (
+        "Replay memory",
+        "Every goal that once was of intermediate difficulty; some are tried again.",
+        False,
+    ),
+    "walls": ("Walls", "The maze, drawn low so that it hides nothing.", True),
+    "body": ("Body", "The newest policy on its way to a goal, at real speed, over and over.", True),
+}
+
+
+def colours(rate: FloatArray) -> NDArray[np.uint8]:
+    """Success in [0, 1], (...), as RGB (..., 3); grey where it is not known."""
+    rate = np.asarray(rate, dtype=float)
+    stops = np.linspace(0, 1, len(STOPS))
+    rgb = np.stack([np.interp(rate, stops, channel) for channel in STOPS.T], axis=-1)
+    rgb[~np.isfinite(rate)] = 150
+    return rgb.round().astype(np.uint8)
+
+
+def tile_image(maze: Maze, tiles: FloatArray, rate: FloatArray) -> NDArray[np.uint8]:
+    """The coverage map as an RGBA image over the maze's box, top row first.
+
+    Args:
+        maze: the layout.
+        tiles: (K, 2) centres, metres.
+        rate: (K,) success.
+    """
+    rows, columns = maze.free.shape
+    per_cell = max(1, round(np.sqrt(len(tiles) / maze.free.sum())))
+    side = maze.cell_size / per_cell
+    image = np.zeros((rows * per_cell, PIXELS, columns * per_cell, PIXELS, 4), dtype=np.uint8)
+    index = np.floor((tiles - maze.low) / side).astype(int)
+    c = np.clip(index[:, 0], 0, columns * per_cell - 1)
+    r = np.clip(rows * per_cell - 1 - index[:, 1], 0, rows * per_cell - 1)
+    edge = slice(1, None)  # a hairline between the tiles
+    for row, column, colour in zip(r, c, colours(rate), strict=True):
+        image[row, edge, column, edge, :3], image[row, edge, column, edge, 3] = colour, 255
+    return image.reshape(rows * per_cell * PIXELS, columns * per_cell * PIXELS, 4)
+
+
+def on_floor(points: FloatArray, height: float) -> NDArray[np.float32]:
+    """Goals (..., goal_dim) as places in the scene (..., 3): their first two components."""
+    out = np.full((*points.shape[:-1], 3), height, dtype=np.float32)
+    out[..., :2] = points[..., :2]
+    return out
+
+
+def segments(lines: FloatArray) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    """Lines (L, n, goal_dim) with NaN gaps as segments.
+
+    Returns:
+        (S, 2, 3) points, and (S,) the step of the line at which each begins.
+    """
+    lines = on_floor(np.asarray(lines, dtype=np.float32), 0.05)
+    both = np.stack([lines[:-1], lines[1:]], axis=2)  # (L - 1, n, 2, 3)
+    step = np.broadcast_to(np.arange(max(len(lines) - 1, 0))[:, None], both.shape[:2])
+    whole = np.isfinite(both).all(axis=(2, 3))
+    return both[whole], step[whole]
+
+
+class Scene:
+    """The layers of one run in a viser scene.
+
+    Args:
+        server: whose scene it is.
+        maze: the layout, or None where there are no walls.
+        box: (2, goal_dim) low and high corner of the goals.
+        prefix: name of the node under which all is drawn.
+        offset: (x, y) of this run's maze in the scene, metres.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        maze: Maze | None,
+        box: FloatArray,
+        prefix: str = "/run",
+        offset: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        self._scene, self._maze, self._prefix = server.scene, maze, prefix
+        self._low, self._high = np.asarray(box)[:, :2]
+        self._scene.add_frame(prefix, show_axes=False, position=(*offset, 0.0))
+        self._groups = {
+            name: self._scene.add_frame(f"{prefix}/{name}", show_axes=False, visible=shown)
+            for name, (_, _, shown) in LAYERS.items()
+        }
+        self._draw_maze()
+
+    @property
+    def size(self) -> float:
+        """The longer side of the box, metres."""
+        return float((self._high - self._low).max())
+
+    @property
+    def centre(self) -> FloatArray:
+        """The middle of the box, (2,), metres."""
+        return np.asarray((self._low + self._high) / 2)
+
+    def show(self, layer: str, visible: bool) -> None:
+        """Show or hide a layer."""
+        self._groups[layer].visible = visible
+
+    def visible(self, layer: str) -> bool:
+        """Whether a layer is shown."""
+        return bool(self._groups[layer].visible)
+
+    def draw(self, frame: Frame) -> None:
+        """Fill all layers from a frame; what a frame of an older version lacks stays empty."""
+        none = np.empty((0, 2))
+        rate, _ = success(frame)
+        self._draw_coverage(frame["test_goals"], rate)
+        self._draw_goals(frame)
+        self._points("replay", frame.get("replay", none), REPLAYED, 0.012, 0.03)
+        empty = np.empty((0, 0, 2))
+        points, step = segments(frame.get("traces", empty))
+        fade = np.clip(1 - step / max(1, len(frame.get("traces", empty)) - 1), 0.1, 1)[:, None]
+        floor = np.array([235, 235, 235])
+        shade = (floor + (np.array(TRACE) - floor) * fade).astype(np.uint8)
+        self._lines("traces", points, np.repeat(shade[:, None], 2, axis=1), 2.0)
+        points, _ = segments(frame.get("paths", empty))
+        self._lines("paths", points, PATH, 1.0)
+
+    def mark(self, goals: FloatArray, radius: float) -> None:
+        """Draw a ring of that radius around a goal, (1, goal_dim); none around many."""
+        angle = np.linspace(0, 2 * np.pi, 49)
+        circle = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        few = goals[:1, None, :2] if len(goals) == 1 else np.empty((0, 1, 2))
+        points, _ = segments(np.swapaxes(few + circle, 0, 1))
+        self._scene.add_line_segments(
+            self._name("body", "goal"), points, MARK, thickness=3.0, thickness_units="screen"
+        )
+
+    def _name(self, layer: str, node: str = "node") -> str:
+        return f"{self._prefix}/{layer}/{node}"
+
+    def _draw_maze(self) -> None:
+        boxes: Sequence[FloatArray] = [] if self._maze is None else list(self._maze.walls())
+        for i, (x0, y0, x1, y1) in enumerate(boxes):
+            self._scene.add_box(
+                self._name("walls", str(i)),
+                color=WALL,
+                dimensions=(x1 - x0, y1 - y0, WALL_HEIGHT),
+                position=((x0 + x1) / 2, (y0 + y1) / 2, WALL_HEIGHT / 2),
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+        self._scene.add_icosphere(
+            f"{self._prefix}/start", radius=0.1, color=START, position=(0.0, 0.0, 0.1)
+        )
+
+    def _draw_coverage(self, tiles: FloatArray, rate: FloatArray) -> None:
+        if self._maze is None:
+            self._points("coverage", tiles, colours(rate), 0.14, 0.01)
+            return
+        width, height = self._high - self._low
+        self._scene.add_image(
+            self._name("coverage"),
+            tile_image(self._maze, tiles, rate),
+            render_width=float(width),
+            render_height=float(height),
+            format="png",
+            cast_shadow=False,
+            receive_shadow=False,
+            position=(*self.centre, 0.005),
+            wxyz=(0.0, 1.0, 0.0, 0.0),  # viser's images look down; seen from above, y is up
+        )
+
+    def _draw_goals(self, frame: Frame) -> None:
+        goals = frame["goals"]
+        label = frame.get("label", np.zeros(len(goals)))
+        palette = np.array([TOO_HARD, INTERMEDIATE, TOO_EASY], dtype=np.uint8)
+        shade = palette[np.clip(label, -1, 1).astype(int) + 1]
+        old = np.asarray(frame.get("replayed", np.zeros(len(goals))), dtype=bool)
+        for node, rows, size in (("new", ~old, 0.11), ("old", old, 0.06)):
+            # A dark rim, so that white goals are seen on a pale floor.
+            self._points("goals", goals[rows], (20, 20, 20), size * 1.35, 0.035, node + "_rim")
+            self._points("goals", goals[rows], shade[rows], size, 0.045, node)
+
+    def _points(
+        self,
+        layer: str,
+        points: FloatArray,
+        colour: NDArray[np.uint8] | tuple[int, int, int],
+        size: float,
+        height: float,
+        node: str = "node",
+    ) -> None:
+        self._scene.add_point_cloud(
+            self._name(layer, node),
+            on_floor(points, height),
+            colour,
+            point_size=size,
+            point_shape="circle",
+            point_shading="flat",
+            precision="float32",
+        )
+
+    def _lines(
+        self,
+        layer: str,
+        points: NDArray[np.float32],
+        colour: NDArray[np.uint8] | tuple[int, int, int],
+        width: float,
+    ) -> None:
+        self._scene.add_line_segments(
+            self._name(layer), points, colour, thickness=width, thickness_units="screen"
+        )
+
+
+def legend() -> str:
+    """The colours of the map as HTML."""
+    stops = ", ".join(
+        f"rgb({r},{g},{b}) {100 * i / (len(STOPS) - 1):.0f}%" for i, (r, g, b) in enumerate(STOPS)
+    )
+    dots = " ".join(
+        f'<span style="white-space:nowrap"><span style="color:rgb{colour};-webkit-text-stroke:'
+        f'1px #333">&#9679;</span> {text}</span>&nbsp;'
+        for text, colour in (
+            ("too hard", TOO_HARD),
+            ("intermediate", INTERMEDIATE),
+            ("too easy", TOO_EASY),
+        )
+    )
+    return (
+        '<div style="font-size:12px;padding:4px 12px"><div style="display:flex;gap:8px;'
+        'align-items:center"><span>never</span>'
+        f'<div style="flex:1;height:10px;border-radius:5px;background:linear-gradient(90deg,'
+        f'{stops})"></div><span>always reached</span></div><div style="margin-top:4px">{dots}'
+        "</div></div>"
+    )

@@ -1,0 +1,390 @@
+"""The live view: a viser page over one or several run folders.
+
+One thread, the one that calls `View.spin`, reads the runs and writes the scene. What happens in a
+browser only puts a request into a queue; nothing that comes from there becomes a path or code.
+"""
+
+import contextlib
+import io
+import queue
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import viser
+
+from goalgan_bt.config import ConfigError
+from goalgan_bt.envs.maze import FloatArray
+from goalgan_bt.viz.body import Bodies
+from goalgan_bt.viz.curves import Curves
+from goalgan_bt.viz.player import MOST, Attempt, Player
+from goalgan_bt.viz.run import Frame, Run, number, success
+from goalgan_bt.viz.scene import LAYERS, Scene, legend
+
+LOOK_EVERY = 1.0  # seconds between two looks at the run folders
+TICK = 1 / 25  # seconds between two pictures of the body
+PAUSE = 1.0  # seconds for which a finished attempt stands still
+GAP = 1.15  # distance of two mazes side by side, in sides of one
+SILENT = 120.0  # seconds without news after which a run counts as stopped
+
+
+class View:
+    """A page.
+
+    Args:
+        runs: one in full, or several side by side.
+        host, port: where to listen; a busy port is replaced by a free one.
+    """
+
+    def __init__(self, runs: list[Run], host: str = "127.0.0.1", port: int = 8080) -> None:
+        self.runs = runs
+        with contextlib.redirect_stdout(io.StringIO()):  # viser's banner
+            self.server = viser.ViserServer(host=host, port=port, label="goalgan_bt")
+        self._requests: queue.Queue[tuple[str, Any]] = queue.Queue(maxsize=100)
+        self._scenes = []
+        for i, run in enumerate(runs):
+            box = box_of(run)
+            spread = GAP * max(float((box[1] - box[0])[:2].max()), 1.0)
+            self._scenes.append(
+                Scene(self.server, run.maze, box, f"/run{i}", offset=(i * spread, 0.0))
+            )
+        self._shown: int | None = None  # index of the report on show
+        self._playing_since = 0.0
+        self._player: Player | None = None
+        self._bodies: Bodies | None = None
+        self._attempt: Attempt | None = None
+        self._attempt_began = 0.0
+        self._asked: FloatArray | None = None
+        self._last_look = 0.0
+        self._place_camera()
+        self._build_panel()
+        self.server.scene.on_click()(self._clicked)
+        self._look(first=True)
+
+    @property
+    def address(self) -> str:
+        """Where the page is."""
+        host = self.server.get_host()
+        return (
+            f"http://{'localhost' if host in ('0.0.0.0', '::') else host}:{self.server.get_port()}"
+        )
+
+    # The loop.
+
+    def spin(self, seconds: float | None = None) -> None:
+        """Keep the page alive, for ever or for some seconds."""
+        end = None if seconds is None else time.monotonic() + seconds
+        while end is None or time.monotonic() < end:
+            begin = time.monotonic()
+            self.tick(begin)
+            time.sleep(max(0.0, TICK - (time.monotonic() - begin)))
+
+    def tick(self, now: float) -> None:
+        """Do what is due at that time (of `time.monotonic`)."""
+        while not self._requests.empty():
+            self._serve(*self._requests.get(), now)
+        if now - self._last_look >= LOOK_EVERY:
+            self._look()
+            self._last_look = now
+        self._play_time(now)
+        self._play_body(now)
+
+    def close(self) -> None:
+        """Stop the server."""
+        self.server.stop()
+
+    # Time: which report is on show.
+
+    def _look(self, first: bool = False) -> None:
+        """Look for news in the folders, and show them."""
+        news = [run.refresh() for run in self.runs]
+        if any(news) or first:
+            last = max(0, len(self.runs[0].iterations) - 1)
+            self._slider.max = max(1, last)
+            self._slider.disabled = last == 0
+            if self._follow.value and self._slider.value != last:
+                self._slider.value = last
+            self._curves.refresh()
+        if self._follow.value or self._shown is None:
+            self._show(len(self.runs[0].iterations) - 1, force=any(news))
+        self._status.content = self._describe()
+
+    def _show(self, index: int, force: bool = False) -> None:
+        """Draw the report with that index (of the first run) and what the others had by then."""
+        run = self.runs[0]
+        if not run.iterations or (index == self._shown and not force):
+            return
+        index = int(np.clip(index, 0, len(run.iterations) - 1))
+        steps = number(run.row_of(run.iterations[index]).get("steps/train"))
+        with self.server.atomic():
+            for i, (other, scene) in enumerate(zip(self.runs, self._scenes, strict=True)):
+                frame = other.frame(run.iterations[index] if i == 0 else report_at(other, steps))
+                if frame is not None:
+                    try:
+                        scene.draw(frame)
+                    except (KeyError, ValueError, IndexError, TypeError):
+                        continue  # of another version, or damaged: the last picture stays
+        self._shown = index
+        self._caption.content = self._describe_report(index)
+
+    def _play_time(self, now: float) -> None:
+        if not self._play.value:
+            self._playing_since = now
+            return
+        if now - self._playing_since < 1 / self._speed.value:
+            return
+        self._playing_since = now
+        last = len(self.runs[0].iterations) - 1
+        self._slider.value = 0 if self._slider.value >= last else self._slider.value + 1
+        self._show(self._slider.value)
+
+    # The body, and the goals that people set.
+
+    def _play_body(self, now: float) -> None:
+        if len(self.runs) > 1 or (not self._scenes[0].visible("body") and self._asked is None):
+            return
+        if self._attempt is None or now - self._attempt_began > self._attempt.seconds + PAUSE:
+            if self._attempt is not None and self._asked is not None:
+                self._asked = None
+            if not self._ready():
+                return
+            assert self._player is not None
+            self._begin(self._player.some_goal(), now)
+        assert self._attempt is not None and self._bodies is not None
+        step = max(0, int((now - self._attempt_began) / self._attempt.dt))
+        self._bodies.draw(self._attempt.states[min(step, len(self._attempt.states) - 1)])
+        if self._asked is not None:
+            self._outcome.content = self._describe_attempt(now)
+
+    def _ready(self) -> bool:
+        """Whether there is a policy to play; takes up the newest."""
+        if self._player is None:
+            try:
+                self._player = Player(self.runs[0].folder)
+            except (ConfigError, OSError, ValueError):
+                return False
+        return self._player.take_newest()
+
+    def _begin(self, goals: FloatArray, now: float) -> None:
+        assert self._player is not None
+        if self._bodies is None:
+            self._bodies = Bodies(self.server, self._player.model, "/run0/body/points")
+        self._attempt = self._player.attempt(goals)
+        self._attempt_began = time.monotonic()
+        self._scenes[0].mark(goals, self._player.env.success_radius)
+
+    def _serve(self, request: str, value: Any, now: float) -> None:
+        if request == "slider":
+            self._show(int(value))
+        elif request == "layer":
+            for scene in self._scenes:
+                scene.show(*value)
+            if value[0] == "body" and self._bodies is not None:
+                self._bodies.show(value[1])
+        elif request in ("goal", "all") and len(self.runs) == 1:
+            if not self._ready():
+                self._outcome.content = (
+                    "There is no policy yet: it comes with the first checkpoint."
+                )
+                return
+            assert self._player is not None
+            env = self._player.env
+            goals = env.test_goals()[:MOST]
+            if request == "goal":
+                goals = np.zeros((1, env.goal_dim))
+                goals[0, :2] = value
+                if not env.feasible(goals)[0]:
+                    self._outcome.content = "No body can be there: click on a free place."
+                    return
+            self._asked = goals
+            self._outcome.content = "..."
+            self._begin(goals, now)
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+        if direction[2] < -1e-6:  # it meets the floor
+            place = origin - direction * origin[2] / direction[2]
+            self._ask("goal", place[:2])
+
+    def _ask(self, request: str, value: Any) -> None:
+        with contextlib.suppress(queue.Full):  # clicks faster than anything can be shown
+            self._requests.put_nowait((request, value))
+
+    # The panel.
+
+    def _place_camera(self) -> None:
+        first, last = self._scenes[0], self._scenes[-1]
+        size = first.size * (1 + GAP * (len(self._scenes) - 1))
+        middle = (first.centre + last.centre) / 2
+        middle[0] += GAP * first.size * (len(self._scenes) - 1) / 2
+        camera = self.server.initial_camera
+        camera.position = (middle[0], middle[1] - 0.75 * size, 1.25 * size)
+        camera.look_at = (middle[0], middle[1], 0.0)
+        camera.up = (0.0, 0.0, 1.0)
+
+    def _build_panel(self) -> None:
+        gui = self.server.gui
+        gui.configure_theme(
+            control_width="medium", show_logo=False, show_share_button=False, dark_mode=True
+        )
+        self._status = gui.add_markdown("")
+        gui.add_html(legend())
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Time"):
+            self._caption = gui.add_markdown("No report yet: the first one comes soon.")
+            # viser declares `value` read-only, which it is not.
+            self._slider: Any = gui.add_slider("Report", min=0, max=1, step=1, initial_value=0)
+            self._follow: Any = gui.add_checkbox("Follow live", True)
+            self._play: Any = gui.add_checkbox("Play", False)
+            self._speed = gui.add_slider("Reports per second", 1, 20, 1, 5)
+            with gui.add_folder("Layers"):
+                for name, (label, hint, shown) in LAYERS.items():
+                    box = gui.add_checkbox(label, shown, hint=hint)
+                    box.on_update(partial(self._layer_switched, name))
+        self._slider.on_update(self._slid)
+        self._play.on_update(lambda event: self._stop_following())
+        if len(self.runs) == 1:
+            with tabs.add_tab("Try"):
+                gui.add_markdown(
+                    "**Click on the floor to set a goal.** The newest policy tries it from the "
+                    "start, at real speed. The ring is where the goal counts as reached."
+                )
+                button = gui.add_button("Try all tiles")
+                button.on_click(lambda _: self._ask("all", None))
+                self._outcome = gui.add_markdown("No goal set yet.")
+        with tabs.add_tab("Curves"):
+            self._curves = Curves(gui, self.runs)
+        with tabs.add_tab("About"):
+            gui.add_markdown(about())
+            download = gui.add_button("This report as CSV")
+            download.on_click(self._download)
+            gui.add_markdown("### Settings\n\n" + settings_table(self.runs[0].settings))
+
+    def _layer_switched(self, name: str, event: Any) -> None:
+        self._ask("layer", (name, event.target.value))
+
+    def _slid(self, event: Any) -> None:
+        if event.client is not None:  # a person, not us
+            self._stop_following()
+            self._ask("slider", event.target.value)
+
+    def _stop_following(self) -> None:
+        self._follow.value = False
+
+    def _download(self, event: Any) -> None:
+        run = self.runs[0]
+        frame = run.frame(run.iterations[self._shown]) if self._shown is not None else None
+        if frame is not None and event.client is not None:
+            event.client.send_file_download("coverage.csv", as_csv(frame))
+
+    # Words.
+
+    def _describe(self) -> str:
+        return "\n\n".join(f"**{run.name}** {state(run)}" for run in self.runs)
+
+    def _describe_report(self, index: int) -> str:
+        run = self.runs[0]
+        iteration = run.iterations[index]
+        frame, row = run.frame(iteration), run.row_of(iteration)
+        words = [f"Iteration {iteration:,}"]
+        if row:
+            words.append(f"{number(row.get('steps/train')):,.0f} steps")
+        if frame is not None:
+            rate, measured = success(frame)
+            kind = "coverage (measured)" if measured else "coverage (estimated)"
+            words.append(f"{kind} **{np.nanmean(rate) if len(rate) else np.nan:.2f}**")
+        return " · ".join(words)
+
+    def _describe_attempt(self, now: float) -> str:
+        attempt, asked = self._attempt, self._asked
+        assert attempt is not None and asked is not None and self._player is not None
+        done = now - self._attempt_began
+        whose = f"Policy of iteration {self._player.iteration:,}. "
+        if len(asked) == 1:
+            x, y = asked[0, :2]
+            if done < attempt.seconds:
+                return f"{whose}Goal ({x:.1f}, {y:.1f}): on its way, {done:.1f} s"
+            early = attempt.ends[0] * attempt.dt < self._player.env.horizon * self._player.env.dt
+            why = "reached" if attempt.reached[0] else "fell" if early else "not reached"
+            return f"{whose}Goal ({x:.1f}, {y:.1f}): **{why}** after {attempt.seconds:.1f} s"
+        ended = attempt.ends * attempt.dt <= done
+        reached = int((attempt.reached & ended).sum())
+        return f"{whose}All tiles: **{reached} of {len(asked)}** reached, {ended.sum()} ended"
+
+
+def box_of(run: Run) -> FloatArray:
+    """The box of a run's goals, (2, goal_dim), metres."""
+    if run.maze is not None:
+        return np.stack([run.maze.low, run.maze.high])
+    frame = run.frame(run.iterations[0]) if run.iterations else None
+    goals = np.zeros((1, 2)) if frame is None else frame["goals"]
+    return np.stack([np.minimum(goals.min(axis=0), -5), np.maximum(goals.max(axis=0), 5)])
+
+
+def report_at(run: Run, steps: float) -> int:
+    """The iteration of the last report that a run had made after so many steps."""
+    known = dict(zip(run.column("iteration"), run.column("steps/train"), strict=True))
+    before = [i for i in run.iterations if known.get(i, 0) <= steps]
+    return before[-1] if before else (run.iterations[0] if run.iterations else 0)
+
+
+def state(run: Run) -> str:
+    """What goes on in a run, in a few words."""
+    if run.gone:
+        return "is gone: the folder has vanished; this is the last that was seen of it."
+    if not run.rows:
+        return "has begun; no iteration is finished yet."
+    row = run.rows[-1]
+    measured = run.column("eval/coverage")
+    measured = measured[np.isfinite(measured)]
+    coverage = f", coverage {measured[-1]:.2f}" if len(measured) else ""
+    progress = (
+        f"iteration {number(row.get('iteration')):,.0f}, "
+        f"{number(row.get('steps/train')) / 1e6:.2f}M steps, "
+        f"{number(row.get('time/fps')):,.0f} steps/s{coverage}"
+    )
+    if (ended := run.ended()) is not None:
+        return f"ended ({ended}): {progress}"
+    return f"{'learns' if run.age() < SILENT else 'is silent'}: {progress}"
+
+
+def as_csv(frame: Frame) -> bytes:
+    """Test goals and their success as a table."""
+    rate, measured = success(frame)
+    names = [f"goal_{i}" for i in range(frame["test_goals"].shape[1])]
+    lines = [",".join([*names, "success", "measured"])]
+    for goal, value in zip(frame["test_goals"], rate, strict=True):
+        lines.append(",".join([*(f"{x:.4f}" for x in goal), f"{value:.4f}", str(int(measured))]))
+    return ("\n".join(lines) + "\n").encode()
+
+
+def settings_table(settings: dict[str, Any], prefix: str = "") -> str:
+    """The settings as a markdown table."""
+
+    def rows(values: dict[str, Any], prefix: str) -> list[str]:
+        out = []
+        for name, value in values.items():
+            if isinstance(value, dict):
+                out += rows(value, f"{prefix}{name}.")
+            else:
+                text = str(value).replace("|", "/").replace("<", "&lt;").replace("`", "'")
+                out.append(f"| {prefix}{name} | {text} |")
+        return out
+
+    return "\n".join(["| setting | value |", "|---|---|", *rows(settings, prefix)])
+
+
+def about() -> str:
+    """What one is looking at."""
+    return "\n\n".join(f"**{label}.** {text}" for label, text, _ in LAYERS.values())
+
+
+def open_runs(folders: list[Path]) -> list[Run]:
+    """The runs in those folders.
+
+    Raises:
+        RunError: if one is no run.
+    """
+    return [Run(folder) for folder in folders]
