@@ -73,6 +73,12 @@ class Config:
     """Lambda of generalised advantage estimation (the original: 1)."""
     updates: int = 1
     """Policy updates per iteration (the original: 5)."""
+    viz: Literal["browser", "none"] = "browser"
+    """Where to watch: a page in the browser, in a process of its own, or nowhere."""
+    viz_host: str = "127.0.0.1"
+    """Where the page listens; 0.0.0.0 lets everybody on the network in, without a password."""
+    viz_port: int = 8080
+    """The page's port; if it is busy, the next free one is taken and printed."""
     report_every: int = 5
     """Iterations between two reports (a line on the terminal, a frame in the run folder)."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
@@ -184,6 +190,8 @@ def check(cfg: Config) -> None:
     most = 8 * len(os.sched_getaffinity(0))
     if cfg.threads > most:
         raise ConfigError(f"--threads must be at most {most} on this machine, not {cfg.threads}")
+    if not 0 <= cfg.viz_port <= 65535:
+        raise ConfigError(f"--viz-port must be between 0 and 65535, not {cfg.viz_port}")
     if cfg.rollout.num_envs > 100_000:
         raise ConfigError(f"--rollout.num-envs must be at most 100000, not {cfg.rollout.num_envs}")
     if cfg.policy.final_std is not None and cfg.policy.final_std < cfg.policy.min_std:

@@ -45,6 +45,7 @@ from goalgan_bt.learner import Learner
 from goalgan_bt.progress import Progress, complain, say
 from goalgan_bt.record import Record
 from goalgan_bt.rollout import Collector, Float32, Rollouts
+from goalgan_bt.viz.child import Page
 
 TEST_ENVS = 512  # simulations side by side when coverage is measured
 FRAME_TRACES = 64  # traces kept in a frame
@@ -372,7 +373,7 @@ class Stop:
 
 def main() -> int:
     """The command line; returns the exit code."""
-    folder = None
+    folder, page, ended_well = None, None, False
     try:
         with Stop() as stop:
             cfg = config.from_command_line()
@@ -380,7 +381,10 @@ def main() -> int:
             folder = cfg.resume or record.create_folder(cfg.out, env.name, cfg.seed)
             if cfg.resume is None:
                 record.write_meta(folder, env.maze)
+                config.save(cfg, folder)
             say(f"run folder: {folder}")
+            if cfg.viz == "browser":
+                page = Page(folder, cfg.viz_host, cfg.viz_port)
             coverage, steps = train(cfg, folder, stop)
     except KeyboardInterrupt:
         complain(f"interrupted{how_to_go_on(folder)}")
@@ -399,11 +403,17 @@ def main() -> int:
     except MemoryError:
         complain("out of memory: use a smaller --rollout.num-envs")
         return 2
-    if stop.signal is not None:
-        complain(f"stopped by {signal.Signals(stop.signal).name}: go on with --resume {folder}")
-        return 130 if stop.signal == signal.SIGINT else 2
-    say(f"coverage {coverage:.3f} after {steps:,} training steps: {folder}")
-    return 0
+    else:
+        if stop.signal is not None:
+            name = signal.Signals(stop.signal).name
+            complain(f"stopped by {name}: go on with --resume {folder}")
+            return 130 if stop.signal == signal.SIGINT else 2
+        say(f"coverage {coverage:.3f} after {steps:,} training steps: {folder}")
+        ended_well = True
+        return 0
+    finally:
+        if page is not None:
+            page.close(ended_well)
 
 
 def how_to_go_on(folder: Path | None) -> str:

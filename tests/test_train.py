@@ -35,6 +35,7 @@ def settings(env, *more):
 def command(*flags, out):
     tiny = [*TINY["point_umaze"].split(), *FAST.split()]
     words = [sys.executable, "-m", "goalgan_bt.train", *map(str, flags), "--out", str(out)]
+    words += [] if "--viz" in words else ["--viz", "none"]
     return [*words, *(tiny if "--env" in flags else [])]
 
 

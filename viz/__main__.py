@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import os
 import signal
 import sys
 import threading
@@ -37,16 +38,16 @@ def main() -> int:
         from goalgan_bt.viz.view import View, open_runs
 
         view = View(open_runs(list(cfg.runs)), cfg.host, cfg.port)
-        port = view.server.get_port()
-        if cfg.port not in (0, port):
-            complain(f"port {cfg.port} is busy: took {port} instead")
+        busy = cfg.port not in (0, view.server.get_port())
+        say(f"view: {view.address}" + (f" (port {cfg.port} was busy)" if busy else ""))
         if cfg.host in ("0.0.0.0", "::"):
-            complain("everybody who can reach this machine can use the page: there is no password")
-        say(f"view: {view.address}")
+            say("view: everybody who can reach this machine can use it: there is no password")
         signal.signal(signal.SIGTERM, _leave)
+        os.nice(10)  # looking must not slow learning
         if cfg.with_parent:
             threading.Thread(target=_wait_for_parent, daemon=True).start()
-        view.spin()
+        with contextlib.redirect_stdout(None):  # viser tells of every connection
+            view.spin()
     except KeyboardInterrupt:
         return 130
     except (RunError, ValueError, OSError) as error:

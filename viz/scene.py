@@ -24,7 +24,7 @@ TOO_HARD, INTERMEDIATE, TOO_EASY, REPLAYED = (
     (120, 120, 120),
 )
 TRACE, PATH, MARK = (255, 140, 0), (90, 90, 100), (255, 0, 170)
-WALL, START = (120, 126, 135), (255, 255, 255)
+WALL, FLOOR, START = (105, 110, 120), (45, 48, 54), (255, 255, 255)
 PIXELS = 16  # per tile of the coverage map
 WALL_HEIGHT = 0.35  # metres: low, so that no wall hides the map
 
@@ -184,6 +184,15 @@ class Scene:
         return f"{self._prefix}/{layer}/{node}"
 
     def _draw_maze(self) -> None:
+        width, height = self._high - self._low + 0.08 * self.size
+        self._scene.add_box(
+            f"{self._prefix}/floor",
+            color=FLOOR,
+            dimensions=(width, height, 0.02),
+            position=(*self.centre, -0.02),
+            cast_shadow=False,
+            receive_shadow=False,
+        )
         boxes: Sequence[FloatArray] = [] if self._maze is None else list(self._maze.walls())
         for i, (x0, y0, x1, y1) in enumerate(boxes):
             self._scene.add_box(

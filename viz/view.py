@@ -143,6 +143,8 @@ class View:
     # The body, and the goals that people set.
 
     def _play_body(self, now: float) -> None:
+        if not self.server.get_clients():
+            return  # nobody looks
         if len(self.runs) > 1 or (not self._scenes[0].visible("body") and self._asked is None):
             return
         if self._attempt is None or now - self._attempt_began > self._attempt.seconds + PAUSE:
@@ -220,8 +222,9 @@ class View:
         middle = (first.centre + last.centre) / 2
         middle[0] += GAP * first.size * (len(self._scenes) - 1) / 2
         camera = self.server.initial_camera
-        camera.position = (middle[0], middle[1] - 0.75 * size, 1.25 * size)
-        camera.look_at = (middle[0], middle[1], 0.0)
+        right = 0.1 * size  # the panel covers the right of the page
+        camera.position = (middle[0] + right, middle[1] - 0.5 * size, 0.92 * size)
+        camera.look_at = (middle[0] + right, middle[1], 0.0)
         camera.up = (0.0, 0.0, 1.0)
 
     def _build_panel(self) -> None:

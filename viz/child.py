@@ -1,0 +1,55 @@
+"""The page that training opens: `python -m goalgan_bt.viz` as a child process."""
+
+import contextlib
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+from goalgan_bt.progress import complain, say
+
+
+class Page:
+    """A page over a run in a process of its own.
+
+    In a terminal it outlives the training until Ctrl-C; otherwise it ends with this process,
+    however that ends, so that no script waits for it.
+
+    Args:
+        folder: the run folder.
+        host, port: where it shall listen.
+    """
+
+    def __init__(self, folder: Path, host: str, port: int) -> None:
+        self._terminal = sys.stdout.isatty()
+        command = [sys.executable, "-m", "goalgan_bt.viz", str(folder)]
+        command += ["--host", host, "--port", str(port)]
+        self._process = subprocess.Popen(
+            command if self._terminal else [*command, "--with-parent"],
+            stdin=None if self._terminal else subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self._address: str | None = None
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def close(self, ended_well: bool) -> None:
+        """End the page; in a terminal, after a run that ended well, only when people are done."""
+        with contextlib.suppress(KeyboardInterrupt):
+            if self._terminal and ended_well and self._address is not None:
+                say(f"the page stays until Ctrl-C: {self._address}")
+                self._process.wait()
+        self._process.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout=5)
+
+    def _listen(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            if line.startswith("view: "):
+                say(line.strip())
+                if self._address is None:
+                    self._address = line.split()[1]
+            elif line.startswith("error: "):
+                complain(line.removeprefix("error: ").strip())
