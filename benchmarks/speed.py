@@ -39,7 +39,7 @@ class Settings:
     """Alternations of the three measurements."""
     seconds: float = 4.0
     """Duration of each raw and collection measurement."""
-    train_steps: int = 2_000_000
+    train_steps: int = 3_000_000
     """Environment steps of each training run."""
     json: Path | None = None
     """Also write the rows to this file."""

@@ -22,7 +22,7 @@ class CoverageConfig:
 
     rollouts: int = 3
     """Episodes per test goal with the stochastic policy (the original: 2 point, 3 ant)."""
-    every: int = 1_000_000
+    every: int = 1_500_000
     """Training steps between two measurements; one more at the end."""
 
 

@@ -104,6 +104,7 @@ class SuccessEstimator:
         k = self.cfg.neighbours
         if len(self.goals) < k:
             return np.full(len(goals), np.nan)
-        distance = np.square(goals[:, None] - self.goals).sum(axis=2)
+        # The squared distance less |goal|^2, which is the same for all of a row.
+        distance = np.square(self.goals).sum(axis=1) - 2 * goals @ self.goals.T
         nearest = np.argpartition(distance, k - 1, axis=1)[:, :k]
         return np.asarray(self.success[nearest].mean(axis=1))

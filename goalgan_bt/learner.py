@@ -16,7 +16,7 @@ from goalgan_bt.imitation import Imitation
 from goalgan_bt.policy import GaussianPolicy, ValueFunction
 from goalgan_bt.rollout import Episodes
 
-NOISY = ("rollout", "trpo", "value", "gan", "backtracking", "imitation")
+NOISY = ("rollout", "evaluation", "trpo", "value", "gan", "backtracking", "imitation")
 
 
 class Learner:

@@ -147,7 +147,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
             if cfg.goals.label_rollouts:
                 with clock.measure("label"):
                     success, steps = success_rate(
-                        test_env, policy, goals, cfg.goals.label_rollouts, noise["rollout"]
+                        test_env, policy, goals, cfg.goals.label_rollouts, noise["evaluation"]
                     )
                 learner.steps["label"] += steps
             else:
@@ -201,7 +201,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
             if measure:
                 with clock.measure("evaluation"):
                     measured, steps = success_rate(
-                        test_env, policy, test_goals, cfg.coverage.rollouts, noise["rollout"]
+                        test_env, policy, test_goals, cfg.coverage.rollouts, noise["evaluation"]
                     )
                     by_mean, mean_steps = success_rate(test_env, policy, test_goals, 1, None)
                 learner.steps["eval"] += steps + mean_steps
