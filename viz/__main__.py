@@ -46,8 +46,9 @@ def main() -> int:
         os.nice(10)  # looking must not slow learning
         if cfg.with_parent:
             threading.Thread(target=_wait_for_parent, daemon=True).start()
-        with contextlib.redirect_stdout(None):  # viser tells of every connection
-            view.spin()
+        # viser tells of every connection, and who started this may listen no more.
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+        view.spin()
     except KeyboardInterrupt:
         return 130
     except (RunError, ValueError, OSError) as error:

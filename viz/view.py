@@ -84,12 +84,15 @@ class View:
     def tick(self, now: float) -> None:
         """Do what is due at that time (of `time.monotonic`)."""
         while not self._requests.empty():
-            self._serve(*self._requests.get(), now)
+            # A browser may send any value for any control: nonsense is dropped.
+            with contextlib.suppress(TypeError, ValueError, OverflowError):
+                self._serve(*self._requests.get(), now)
         if now - self._last_look >= LOOK_EVERY:
             self._look()
             self._last_look = now
         self._play_time(now)
-        self._play_body(now)
+        if self.server.get_clients():  # otherwise nobody looks
+            self._play_body(now)
 
     def close(self) -> None:
         """Stop the server."""
@@ -133,18 +136,17 @@ class View:
         if not self._play.value:
             self._playing_since = now
             return
-        if now - self._playing_since < 1 / self._speed.value:
+        speed = self._speed.value
+        if now - self._playing_since < 1 / (speed if speed in range(1, 21) else 1):
             return
         self._playing_since = now
-        last = len(self.runs[0].iterations) - 1
-        self._slider.value = 0 if self._slider.value >= last else self._slider.value + 1
+        here = 0 if self._shown is None else self._shown + 1
+        self._slider.value = here if here < len(self.runs[0].iterations) else 0
         self._show(self._slider.value)
 
     # The body, and the goals that people set.
 
     def _play_body(self, now: float) -> None:
-        if not self.server.get_clients():
-            return  # nobody looks
         if len(self.runs) > 1 or (not self._scenes[0].visible("body") and self._asked is None):
             return
         if self._attempt is None or now - self._attempt_began > self._attempt.seconds + PAUSE:
@@ -182,13 +184,13 @@ class View:
             self._show(int(value))
         elif request == "layer":
             for scene in self._scenes:
-                scene.show(*value)
+                scene.show(value[0], bool(value[1]))
             if value[0] == "body" and self._bodies is not None:
-                self._bodies.show(value[1])
+                self._bodies.show(bool(value[1]))
         elif request in ("goal", "all") and len(self.runs) == 1:
             if not self._ready():
                 self._outcome.content = (
-                    "There is no policy yet: it comes with the first checkpoint."
+                    "There is no policy to play: none was saved yet, or by another version."
                 )
                 return
             assert self._player is not None
@@ -297,7 +299,7 @@ class View:
         if frame is not None:
             rate, measured = success(frame)
             kind = "coverage (measured)" if measured else "coverage (estimated)"
-            words.append(f"{kind} **{np.nanmean(rate) if len(rate) else np.nan:.2f}**")
+            words.append(f"{kind} **{np.mean(rate) if len(rate) else np.nan:.2f}**")
         return " · ".join(words)
 
     def _describe_attempt(self, now: float) -> str:

@@ -1,0 +1,335 @@
+"""The page: what it reads, what it draws, what people can do to it."""
+
+import shutil
+import subprocess
+import sys
+import time
+
+import msgspec
+import numpy as np
+import pytest
+import viser
+import websockets.sync.client
+from viser import _messages
+
+from goalgan_bt import config, record
+from goalgan_bt.envs import maze as mazes
+from goalgan_bt.train import train
+from goalgan_bt.viz.curves import joined, thinned
+from goalgan_bt.viz.run import Run, success
+from goalgan_bt.viz.scene import colours, segments, tile_image
+from goalgan_bt.viz.view import View, as_csv, open_runs, report_at
+
+TINY = (
+    "--env point_umaze --iterations 4 --report-every 1 --rollout.num-envs 16 --rollout.steps 20 "
+    "--threads 1 --coverage.rollouts 1 --gan.pretrain-steps 20 --gan.steps 5 "
+    "--backtracking.min-transitions 50"
+)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "point_umaze-test-s0"
+    folder.mkdir()
+    record.write_meta(folder, mazes.layout("umaze"))
+    train(config.from_command_line(TINY.split()), folder)
+    return folder
+
+
+@pytest.fixture
+def folder(trained, tmp_path):
+    """A run of one's own to break."""
+    return shutil.copytree(trained, tmp_path / trained.name)
+
+
+@pytest.fixture
+def view(folder):
+    view = View(open_runs([folder]), port=0)
+    yield view
+    view.close()
+
+
+def node(view, name):
+    return view.server.scene.get_handle_by_name(name)
+
+
+# What it reads.
+
+
+def test_a_run_is_read_whole(folder):
+    run = Run(folder)
+    assert run.iterations == [1, 2, 3, 4] and len(run.rows) == 4
+    assert run.env == "point_umaze" and run.maze.free.sum() == 7
+    assert run.ended() == "complete" and not run.gone
+    rate, measured = success(run.frame(4))
+    assert rate.shape == (112,) and measured
+    assert np.isclose(rate.mean(), run.column("eval/coverage")[-1], atol=1e-5)
+
+
+def test_news_is_seen_and_only_news(folder):
+    run = Run(folder)
+    assert not run.refresh()
+    shutil.copy(folder / "frames/000004.npz", folder / "frames/000009.npz")
+    assert run.refresh() and run.iterations[-1] == 9
+    with (folder / "metrics.csv").open("a") as file:
+        file.write("5,")  # a line that is being written
+    assert run.refresh() and len(run.rows) == 4
+    assert not run.refresh()
+
+
+def test_a_frame_that_is_written_anew_is_read_anew(folder):
+    run = Run(folder)
+    assert run.frame(2)["goals"].shape != (1, 2)
+    record.Record(folder, 4).frame(2, goals=np.zeros((1, 2)), coverage=np.zeros(3))
+    assert run.frame(2)["goals"].shape == (1, 2)
+
+
+@pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 nothing", None])
+def test_a_damaged_frame_is_no_frame(folder, damage):
+    path = folder / "frames/000003.npz"
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2] if damage is None else damage)
+    assert Run(folder).frame(3) is None
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 255
+    path.write_bytes(flipped)
+    Run(folder).frame(3)  # whatever it gives, it does not raise
+
+
+def test_a_folder_that_vanishes_leaves_what_was_seen(folder):
+    run = Run(folder)
+    frame = run.frame(4)
+    shutil.rmtree(folder)
+    assert not run.refresh() and run.gone
+    assert run.frame(4) is frame and run.frame(1) is None and len(run.rows) == 4
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path):
+    with pytest.raises(record.RunError, match="is no run"):
+        Run(tmp_path)
+
+
+def test_ten_thousand_frames_are_listed_fast_and_not_all_kept(folder):
+    source = folder / "frames/000004.npz"
+    for i in range(5, 10_001):
+        (folder / f"frames/{i:06d}.npz").hardlink_to(source)
+    run = Run(folder)
+    assert len(run.iterations) == 10_000
+    begin = time.perf_counter()
+    run.refresh()
+    assert time.perf_counter() - begin < 1.0
+    for i in range(1, 200):
+        run.frame(i)
+    assert len(run._frames) <= 64
+
+
+# What it draws.
+
+
+def test_colours_run_from_red_to_blue_and_grey_is_unknown():
+    red, blue, grey = colours(np.array([0.0, 1.0, np.nan])).astype(int)
+    assert red[0] > 150 > red[2] and blue[2] > 140 > blue[0]
+    assert grey[0] == grey[1] == grey[2]
+
+
+def test_each_tile_lies_where_it_is_on_the_map():
+    """The one mastered tile is where it belongs: x to the right, y up, in any order of tiles."""
+    maze = mazes.layout("umaze")
+    tiles = maze.tiles()
+    order = np.random.default_rng(0).permutation(len(tiles))
+    for mastered in (0, 17, 60, 111):
+        rate = np.zeros(len(tiles))
+        rate[mastered] = 1.0
+        image = tile_image(maze, tiles[order], rate[order]).astype(int)
+        rows, columns = np.nonzero((image[..., 2] > image[..., 0]) & (image[..., 3] > 0))
+        height, width = image.shape[:2]
+        x = maze.low[0] + (columns.mean() + 0.5) / width * (maze.high - maze.low)[0]
+        y = maze.high[1] - (rows.mean() + 0.5) / height * (maze.high - maze.low)[1]
+        assert np.allclose((x, y), tiles[mastered], atol=0.05)
+        assert len(rows) == 15 * 15  # one tile and no more
+    painted = image[..., 3] > 0
+    assert painted.sum() == 112 * 15 * 15  # no wall
+
+
+def test_segments_leave_out_gaps():
+    lines = np.array([[[0.0, 0]], [[1, 0]], [[np.nan, 0]], [[3, 0]], [[4, 0]]])
+    points, step = segments(lines)
+    assert points[:, :, 0].tolist() == [[0, 1], [3, 4]] and step.tolist() == [0, 3]
+
+
+def test_curves_are_thinned_to_their_ends_and_joined_over_gaps():
+    assert thinned(10_000)[[0, -1]].tolist() == [0, 9_999] and len(thinned(10_000)) == 400
+    nan = np.nan
+    filled = joined(np.arange(5.0), np.array([nan, 1, nan, 3, nan]))
+    assert np.array_equal(filled, [nan, 1, 2, 3, nan], equal_nan=True)
+
+
+def test_the_last_report_is_on_show_and_follows_the_run(view, folder):
+    assert "Iteration 4" in view._caption.content and "measured" in view._caption.content
+    before = node(view, "/run0/coverage/node").image.copy()
+    record.Record(folder, 4)
+    frame = dict(record.read_frame(folder / "frames/000004.npz"))
+    frame["coverage"] = 1 - frame["coverage"]
+    record.Record(folder, 4).frame(6, **frame)
+    view._last_look = 0.0
+    view.tick(time.monotonic())
+    assert "Iteration 6" in view._caption.content
+    assert not np.array_equal(before, node(view, "/run0/coverage/node").image)
+
+
+def test_going_back_shows_the_past_until_one_follows_again(view, folder):
+    view._follow.value = False
+    view._ask("slider", 0)
+    view.tick(time.monotonic())
+    assert "Iteration 1 " in view._caption.content
+    shutil.copy(folder / "frames/000004.npz", folder / "frames/000009.npz")
+    view._look()
+    assert "Iteration 1 " in view._caption.content
+    view._follow.value = True
+    view._look()
+    assert "Iteration 9" in view._caption.content
+
+
+def test_playing_goes_through_all_reports(view):
+    view._play.value, view._speed.value = True, 20
+    seen, end = set(), time.monotonic() + 5
+    while time.monotonic() < end and len(seen) < 4:
+        view.tick(time.monotonic())
+        seen.add(view._shown)
+    assert seen == {0, 1, 2, 3}
+
+
+def test_layers_are_shown_and_hidden(view):
+    assert not node(view, "/run0/paths").visible
+    view._ask("layer", ("paths", True))
+    view._ask("layer", ("goals", False))
+    view.tick(time.monotonic())
+    assert node(view, "/run0/paths").visible and not node(view, "/run0/goals").visible
+
+
+def test_frames_of_an_older_version_are_drawn_as_far_as_they_go(folder):
+    frame = record.read_frame(folder / "frames/000004.npz")
+    few = {k: frame[k] for k in ("goals", "coverage", "test_goals")}
+    record.Record(folder, 4).frame(5, **few)
+    record.Record(folder, 5).frame(6, coverage=np.zeros(3))
+    record.Record(folder, 6).frame(7, **{**few, "coverage": np.full(112, np.nan)})
+    view = View(open_runs([folder]), port=0)
+    for index in range(7):
+        view._show(index)
+    view.close()
+
+
+def test_the_page_outlives_its_folder(view, folder):
+    shutil.rmtree(folder)
+    view._look()
+    view._ask("goal", [0.0, 0.0])
+    view.tick(time.monotonic())
+    assert "is gone" in view._status.content
+
+
+def test_several_runs_stand_side_by_side(trained, folder):
+    view = View(open_runs([trained, folder]), port=0)
+    assert node(view, "/run1").position[0] > node(view, "/run0").position[0] + 6
+    view.tick(time.monotonic())
+    view.close()
+    assert report_at(Run(folder), 0) == 1 and report_at(Run(folder), np.inf) == 4
+
+
+# What people can do to it.
+
+
+def test_a_click_leads_to_an_attempt_with_an_outcome(view):
+    view._ask("goal", np.array([0.2, 0.0]))  # within reach from the first moment
+    view.tick(time.monotonic())
+    end = time.monotonic() + 30
+    while "reached" not in view._outcome.content and time.monotonic() < end:
+        view._play_body(time.monotonic())
+    assert "Goal (0.2, 0.0): **reached** after" in view._outcome.content
+
+
+def test_a_click_into_a_wall_is_answered(view):
+    view._ask("goal", np.array([0.0, 2.0]))
+    view.tick(time.monotonic())
+    assert "free place" in view._outcome.content
+
+
+def test_without_a_policy_it_says_so(folder):
+    (folder / "checkpoint.pt").unlink()
+    view = View(open_runs([folder]), port=0)
+    view._ask("all", None)
+    view.tick(time.monotonic())
+    assert "no policy to play" in view._outcome.content
+    view.close()
+
+
+def test_csv_has_a_line_per_tile(folder):
+    lines = as_csv(record.read_frame(folder / "frames/000004.npz")).decode().splitlines()
+    assert lines[0] == "goal_0,goal_1,success,measured" and len(lines) == 113
+    assert all(line.endswith(",1") for line in lines[1:])
+
+
+def test_a_foreign_page_changes_no_file_and_ends_nothing(view, folder):
+    """A page of another origin sends nonsense to every control there is."""
+    before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    controls = list(view.server.gui._gui_input_handle_from_uuid)
+    assert len(controls) >= 13
+    address = f"ws://127.0.0.1:{view.server.get_port()}"
+    nonsense = ("../../etc/passwd", "__import__('os').remove('x')", -(10**9), None, [1], {"a": 1})
+    with websockets.sync.client.connect(
+        address,
+        subprotocols=[f"viser-v{viser.__version__}"],
+        origin="https://evil.example",
+        max_size=None,
+    ) as socket:
+        for uuid in controls:
+            for value in nonsense:
+                message = _messages.GuiUpdateMessage(uuid, {"value": value})
+                socket.send(msgspec.msgpack.encode(message.as_serializable_dict()))
+        time.sleep(0.5)
+        for _ in range(50):
+            view.tick(time.monotonic())
+            time.sleep(0.01)
+    assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before
+    view._follow.value = True
+    view._look()
+    assert "Iteration 4" in view._caption.content
+
+
+# The command.
+
+
+def command(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "goalgan_bt.viz", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "python -m goalgan_bt.viz RUN"),
+        (["nowhere"], "nowhere is no run"),
+        (["nowhere", "--port", "99999"], "--port must be between 0 and 65535"),
+        (["nowhere", "--frobnicate"], "--help"),
+    ],
+)
+def test_bad_input_ends_in_one_line_and_code_2(arguments, message):
+    done = command(*arguments)
+    assert done.returncode == 2 and message in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_it_listens_here_only_and_ends_with_its_parent(folder):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "goalgan_bt.viz", folder, "--port", "0", "--with-parent"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    line = process.stdout.readline()
+    assert line.startswith("view: http://127.0.0.1:")
+    process.stdin.close()
+    assert process.wait(timeout=20) == 130
