@@ -104,9 +104,8 @@ ANT = Config(
     discount=0.993,
     updates=4,
     policy=PolicyConfig(init_std=0.2, final_std=0.07),
-    value=ValueConfig(epochs=1, minibatch=1024),
     rollout=RolloutConfig(num_envs=256, steps=50),
-    trpo=TrpoConfig(final_kl=0.005),
+    gan=GanConfig(steps=100),
     backtracking=BacktrackingConfig(trace_length=50),
     imitation=ImitationConfig(steps=5, learning_rate=1e-5, max_kl=0.0005),
 )
@@ -154,7 +153,7 @@ def check(cfg: Config) -> None:
         "policy.init_std policy.final_std policy.min_std policy.hidden value.hidden "
         "value.learning_rate value.epochs value.minibatch gan.learning_rate gan.batch gan.steps "
         "gan.noise_dim gan.pretrain_steps gan.generator_hidden gan.discriminator_hidden "
-        "trpo.max_kl trpo.final_kl trpo.cg_iters trpo.fisher_fraction trpo.line_search_decay "
+        "trpo.max_kl trpo.cg_iters trpo.fisher_fraction trpo.line_search_decay "
         "backtracking.batch backtracking.buffer backtracking.learning_rate backtracking.hidden "
         "backtracking.min_transitions backtracking.max_shift imitation.batch "
         "imitation.learning_rate imitation.max_kl coverage.rollouts coverage.every"

@@ -61,11 +61,6 @@ def mlp(sizes: tuple[int, ...], activation: type[nn.Module], output_gain: float 
     return nn.Sequential(*layers)
 
 
-def anneal(first: float, last: float | None, progress: float) -> float:
-    """On a line from first to last as a run progresses from 0 to 1; first if there is no last."""
-    return first if last is None else first + min(progress, 1.0) * (last - first)
-
-
 class Normaliser(nn.Module):
     """Running mean and variance of observations; maps them to about unit scale, within +-5."""
 
@@ -126,10 +121,8 @@ class GaussianPolicy(nn.Module):
 
     def cap_std(self, progress: float) -> None:
         """Set the bound on the standard deviation for this progress in the run, 0 to 1."""
-        bounded = self.cfg.final_std is not None
-        self._max_std = (
-            anneal(self.cfg.init_std, self.cfg.final_std, progress) if bounded else math.inf
-        )
+        first, last = self.cfg.init_std, self.cfg.final_std
+        self._max_std = math.inf if last is None else first + min(progress, 1.0) * (last - first)
 
     def forward(self, normalised: Tensor) -> tuple[Tensor, Tensor]:
         """Mean (n, act_dim) and log standard deviation (act_dim,) at normalised observations."""

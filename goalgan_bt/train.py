@@ -109,8 +109,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
         while not last:
             learner.iteration += 1
             metrics: dict[str, float] = {"iteration": learner.iteration}
-            done = finished(cfg, learner, clock.total())
-            policy.cap_std(done)
+            policy.cap_std(finished(cfg, learner, clock.total()))
 
             # Goals: most imagined by the generator, some remembered so that old skills stay.
             imagined = learner.gan.sample(cfg.goals.new)
@@ -138,7 +137,6 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                         flat(advantages),
                         cfg.trpo,
                         noise["trpo"],
-                        done,
                     )
                     metrics |= group("trpo", step) | group("value", value_fit.result())
                     metrics |= group("backtracking", model_fit.result())

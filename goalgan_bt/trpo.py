@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-from goalgan_bt.policy import GaussianPolicy, anneal, log_prob, mean_kl
+from goalgan_bt.policy import GaussianPolicy, log_prob, mean_kl
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,6 @@ class TrpoConfig:
 
     max_kl: float = 0.03
     """Bound on the mean KL of one update, nats (the original: 0.01)."""
-    final_kl: float | None = None
-    """If given, the bound falls on a line from max_kl to this over the run."""
     cg_iters: int = 10
     """Conjugate gradient iterations."""
     cg_damping: float = 0.01
@@ -122,7 +120,6 @@ def update(
     advantages: Tensor,
     cfg: TrpoConfig,
     generator: torch.Generator | None = None,
-    progress: float = 0.0,
 ) -> dict[str, float]:
     """One trust-region step on a batch that the present policy sampled.
 
@@ -133,12 +130,10 @@ def update(
         advantages: (n,), normalised here.
         cfg: settings.
         generator: picks the subsample of the Fisher matrix.
-        progress: of the run, 0 to 1, for the settings that change with it.
 
     Returns:
         surrogate (its gain), kl, gradient_norm, accepted (1 or 0), nonfinite (1 or 0).
     """
-    max_kl = anneal(cfg.max_kl, cfg.final_kl, progress)
     params = [*policy.net.parameters(), policy.log_std]
     advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
     mean, log_std = policy(normalised)
@@ -160,7 +155,7 @@ def update(
     product = fisher_vector_product(policy, subset, cfg.cg_damping)
     direction = conjugate_gradient(product, gradient, cfg.cg_iters)
     curvature = direction @ product(direction)  # g' F^-1 g
-    full_step = direction * torch.sqrt(2 * max_kl / (curvature + 1e-12))
+    full_step = direction * torch.sqrt(2 * cfg.max_kl / (curvature + 1e-12))
     if not torch.isfinite(full_step).all():
         return stats | {"nonfinite": 1.0}
 
@@ -175,7 +170,7 @@ def update(
         return gain.item(), mean_kl(old_mean, old_log_std, new_mean, new_log_std).item()
 
     found = line_search(
-        evaluate, start, full_step, max_kl, cfg.line_search_steps, cfg.line_search_decay
+        evaluate, start, full_step, cfg.max_kl, cfg.line_search_steps, cfg.line_search_decay
     )
     if found is None:
         vector_to_parameters(start, params)
