@@ -26,7 +26,8 @@ def load(learner: Learner, folder: Path) -> None:
     try:
         learner.load_state_dict(torch.load(path, weights_only=True))
     except Exception as error:  # torch raises many kinds for a damaged file
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        words = str(error).strip().splitlines() or [type(error).__name__]
+        reason = words[0].split(". ")[0][:160]
         raise RunError(
-            f"cannot resume from {path}: it is damaged or of other settings ({reason[:160]})"
+            f"cannot resume from {path}: it is damaged or of other settings ({reason})"
         ) from None

@@ -47,12 +47,14 @@ class Config:
     total_steps: int | None = None
     """Stop after this many environment steps of training."""
     minutes: float | None = None
-    """Stop after this much wall time, minutes."""
+    """Stop after this much wall time, minutes. What anneals then follows the clock, so that a seed
+    alone does not repeat the run."""
     out: Path = Path("runs")
     """Folder of runs; this run gets a folder of its own in it."""
     resume: Path | None = None
     """Go on with this run (its folder): its settings are the defaults, and its limits, which count
-    from its beginning, hold unless others are given."""
+    from its beginning, hold unless others are given. With later limits the exploration noise goes
+    back up to where it would be in so long a run."""
     map: Path | None = None
     """Text map that replaces the maze: '#' wall, '.' free, 'S' start."""
     dim: int = 2
@@ -291,7 +293,7 @@ def _value_of(argv: list[str], flag: str) -> str | None:
     """The value given to a flag, as `--flag value` or `--flag=value`; the last one counts."""
     value = None
     for word, following in zip(argv, [*argv[1:], None], strict=True):
-        if word == flag:
+        if word == flag and following is not None and not following.startswith("--"):
             value = following
         elif word.startswith(flag + "="):
             value = word.split("=", 1)[1]

@@ -134,6 +134,7 @@ class Learner:
         self.estimator.goals = state["estimator_goals"].numpy().copy()
         self.estimator.success = state["estimator_success"].numpy().copy()
         saved = state["transitions"]
+        self.transitions.size = self.transitions.cursor = 0
         oldest = int(saved["cursor"]) % max(1, len(saved["states"]))
         columns = ("states", "actions", "next_states")
         self.transitions.add(*(np.roll(saved[name].numpy(), -oldest, axis=0) for name in columns))

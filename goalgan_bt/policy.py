@@ -111,22 +111,27 @@ class MeanNetwork(nn.Module):
 class GaussianPolicy(nn.Module):
     """pi(a | s, g): a diagonal Gaussian whose mean is a `MeanNetwork`."""
 
+    max_std: Tensor
+
     def __init__(self, obs_dim: int, act_dim: int, cfg: PolicyConfig) -> None:
         super().__init__()
         self.normaliser = Normaliser(obs_dim)
         self.net = MeanNetwork((obs_dim, *cfg.hidden, act_dim))
         self.log_std = nn.Parameter(torch.full((act_dim,), math.log(cfg.init_std)))
         self.cfg = cfg
+        # A buffer: whoever loads the policy acts with the noise that it had.
+        self.register_buffer("max_std", torch.zeros((), dtype=torch.float64))
         self.cap_std(0.0)
 
     def cap_std(self, progress: float) -> None:
         """Set the bound on the standard deviation for this progress in the run, 0 to 1."""
         first, last = self.cfg.init_std, self.cfg.final_std
-        self._max_std = math.inf if last is None else first + min(progress, 1.0) * (last - first)
+        cap = math.inf if last is None else first + min(progress, 1.0) * (last - first)
+        self.max_std.fill_(cap)
 
     def forward(self, normalised: Tensor) -> tuple[Tensor, Tensor]:
         """Mean (n, act_dim) and log standard deviation (act_dim,) at normalised observations."""
-        log_std = self.log_std.clamp(math.log(self.cfg.min_std), math.log(self._max_std))
+        log_std = self.log_std.clamp(math.log(self.cfg.min_std), math.log(self.max_std.item()))
         return self.net(normalised), log_std
 
     @torch.inference_mode()

@@ -11,6 +11,7 @@ runs/<env>-<time>-s<seed>/
 """
 
 import csv
+import fcntl
 import io
 import json
 import os
@@ -89,6 +90,11 @@ class Record:
 
     def __init__(self, folder: Path, iteration: int = 0) -> None:
         self.folder = folder
+        self._lock = (folder / "lock").open("w")
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RunError(f"{folder} is being trained by another process: wait for it") from None
         self._rows: list[dict[str, str]] = []
         self._columns: list[str] = []
         (folder / "frames").mkdir(exist_ok=True)
@@ -137,6 +143,7 @@ class Record:
     def close(self, how: str) -> None:
         """Say how the run ended, and flush what TensorBoard buffers."""
         (self.folder / ENDED).write_text(how + "\n")
+        self._lock.close()
         if self._events is not None:
             self._events.close()
 

@@ -54,9 +54,11 @@ class Rollouts:
     achieved: Float32
 
     def paths(self, n: int) -> Float32:
-        """Where the first n simulations went, (T, n, goal_dim), NaN where an episode ended."""
+        """Where the first n simulations went, (T, n, goal_dim), NaN at the first step of another
+        episode."""
         ended = (self.terminated | self.truncated)[:, :n, None]
-        return np.where(ended, np.float32(np.nan), self.achieved[:, :n])
+        begun = np.concatenate([np.zeros_like(ended[:1]), ended[:-1]])
+        return np.where(begun, np.float32(np.nan), self.achieved[:, :n])
 
     def next_values(self, values: Float32, value: Callable[[Float32], Float32]) -> Float32:
         """V of the state that followed each step, (T, N), given V of `obs`, (T, N)."""

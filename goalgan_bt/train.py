@@ -79,11 +79,11 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                 f"{folder} has reached its limits ({learner.iteration} iterations, "
                 f"{learner.steps['train']} steps): ask for more, for example with --total-steps"
             )
+    records = Record(folder, learner.iteration)
     config.save(cfg, folder)
     policy, rng, noise = learner.policy, learner.rng, learner.noise
     collector = Collector(env, cfg.rollout, rng, noise["rollout"])
     test_goals = env.test_goals()
-    records = Record(folder, learner.iteration)
     clock = Clock(learner.seconds)
     coverage = float("nan")
     everyone = np.arange(env.num_envs)
@@ -222,6 +222,9 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                 "backtracking/traces": traces.valid.shape[1],
                 "backtracking/valid": float(traces.valid.mean()) if traces.valid.size else np.nan,
             }
+            if measure:
+                learner.seconds = clock.total()
+                checkpoint.save(learner, folder)
             records.metrics(metrics)
             if measure or learner.iteration % cfg.report_every == 0:
                 done = finished(cfg, learner, clock.total())
@@ -230,7 +233,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                     learner.iteration,
                     goals=goals,
                     success=success,
-                    label=np.where(labels, 0, np.where(success < cfg.goals.r_max, -1, 1)),
+                    label=np.where(labels, 0, np.where(success >= cfg.goals.r_max, 1, -1)),
                     replayed=np.arange(len(goals)) >= len(imagined),
                     replay=learner.replay.goals,
                     traces=traces.paths(env)[:, :FRAME_TRACES],
@@ -240,9 +243,6 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                     estimate=estimate,
                     coverage=measured,
                 )
-            if measure:
-                learner.seconds = clock.total()
-                checkpoint.save(learner, folder)
     complete = finished(cfg, learner, clock.total()) >= 1
     records.close("complete" if complete else "stopped early: --resume goes on")
     return Trained(coverage, learner.steps["train"])
@@ -371,6 +371,8 @@ class Stop:
 
 def main() -> int:
     """The command line; returns the exit code."""
+    for number in (signal.SIGINT, signal.SIGTERM):  # from here on somebody catches it
+        signal.signal(number, signal.default_int_handler)
     folder, page, ended_well = None, None, False
     try:
         with Stop() as stop:
@@ -393,6 +395,8 @@ def main() -> int:
         elif isinstance(error, BrokenPipeError):
             sys.stdout = sys.stderr  # nobody reads standard output any more
             complain(f"standard output was closed{how_to_go_on(folder)}")
+        elif isinstance(error, FileNotFoundError) and folder is not None and not folder.exists():
+            complain(f"the run folder {folder} has vanished: start again")
         elif isinstance(error, (config.ConfigError, record.RunError, MapError, OSError)):
             complain(str(error))
         else:

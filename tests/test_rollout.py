@@ -132,6 +132,6 @@ def test_paths_follow_the_body_and_break_where_an_episode_ends():
     paths = rollouts.paths(3)
     ended = np.isnan(paths).any(axis=2)
     assert paths.shape == (25, 3, 2)
-    assert (np.flatnonzero(ended[:, 0]) == [9, 19]).all()
+    assert (np.flatnonzero(ended[:, 0]) == [10, 20]).all()
     assert np.allclose(paths[:9, 0], rollouts.obs[1:10, 0, :2], atol=1e-6)
     assert np.allclose(paths[-1, 0], env.read_states(np.arange(3))[0, :2], atol=1e-6)

@@ -1,5 +1,7 @@
 """The whole thing, small: the real command in a process of its own, and what it leaves behind."""
 
+import os
+import pty
 import signal
 import subprocess
 import sys
@@ -294,3 +296,37 @@ def test_help_shows_defaults_of_the_preset():
     )
     assert done.returncode == 0
     assert "4000000" in done.stdout and "--backtracking.trace-length" in done.stdout
+
+
+def test_a_run_that_is_being_trained_is_left_alone(tmp_path):
+    process, folder = start(out=tmp_path)
+    process.stdout.readline()
+    done = run("--resume", folder, out=tmp_path)
+    process.kill()
+    process.wait(timeout=20)
+    assert done.returncode == 2
+    assert "is being trained by another process" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_in_a_terminal_the_page_stays_until_ctrl_c(tmp_path):
+    """Ctrl-C after a run that ended well ends the page, silently and well."""
+    master, slave = pty.openpty()
+    process = subprocess.Popen(
+        command(
+            *("--env", "point_umaze", "--iterations", "1", "--viz", "browser", "--viz-port", "0"),
+            out=tmp_path,
+        ),
+        stdin=slave,
+        stdout=slave,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    os.close(slave)
+    seen = b""
+    while b"the page stays until Ctrl-C" not in seen:
+        seen += os.read(master, 1000)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    os.close(master)
+    assert process.returncode == 0 and errors == ""

@@ -8,6 +8,7 @@ import time
 import msgspec
 import numpy as np
 import pytest
+import torch
 import viser
 import websockets.sync.client
 from viser import _messages
@@ -16,6 +17,7 @@ from goalgan_bt import config, record
 from goalgan_bt.envs import maze as mazes
 from goalgan_bt.train import train
 from goalgan_bt.viz.curves import joined, thinned
+from goalgan_bt.viz.player import Player
 from goalgan_bt.viz.run import Run, success
 from goalgan_bt.viz.scene import colours, segments, tile_image
 from goalgan_bt.viz.view import View, as_csv, open_runs, report_at
@@ -262,6 +264,14 @@ def test_without_a_policy_it_says_so(folder):
     view.close()
 
 
+def test_the_body_acts_with_the_noise_that_was_recorded(folder):
+    player = Player(folder)
+    assert player.take_newest()
+    policy = player._learner.policy
+    std = float(policy(torch.zeros(1, player.env.obs_dim))[1].exp().mean())
+    assert np.isclose(std, Run(folder).column("rollout/std")[-1], rtol=1e-4)
+
+
 def test_csv_has_a_line_per_tile(folder):
     lines = as_csv(record.read_frame(folder / "frames/000004.npz")).decode().splitlines()
     assert lines[0] == "goal_0,goal_1,success,measured" and len(lines) == 113
@@ -332,4 +342,4 @@ def test_it_listens_here_only_and_ends_with_its_parent(folder):
     line = process.stdout.readline()
     assert line.startswith("view: http://127.0.0.1:")
     process.stdin.close()
-    assert process.wait(timeout=20) == 130
+    assert process.wait(timeout=20) == 0

@@ -1,19 +1,23 @@
 """Open a page over run folders: `python -m goalgan_bt.viz RUN [RUN ...]`."""
 
-import contextlib
-import io
 import os
 import signal
 import sys
+
+if __name__ == "__main__":  # a page has nothing to lose: it goes at once, without a word
+    signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+    signal.signal(signal.SIGTERM, lambda *_: os._exit(2))
+
+import contextlib
+import io
+import socket
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 
 import tyro
 
 from goalgan_bt.progress import complain, say
-from goalgan_bt.record import RunError
 
 
 @dataclass(frozen=True)
@@ -37,21 +41,23 @@ def main() -> int:
         # Only now: this imports torch and MuJoCo, and --help shall not wait for them.
         from goalgan_bt.viz.view import View, open_runs
 
+        family = socket.AF_INET6 if ":" in cfg.host else socket.AF_INET
+        socket.create_server((cfg.host, 0), family=family).close()  # can we listen there?
         view = View(open_runs(list(cfg.runs)), cfg.host, cfg.port)
         busy = cfg.port not in (0, view.server.get_port())
         say(f"view: {view.address}" + (f" (port {cfg.port} was busy)" if busy else ""))
         if cfg.host in ("0.0.0.0", "::"):
             say("view: everybody who can reach this machine can use it: there is no password")
-        signal.signal(signal.SIGTERM, _leave)
         os.nice(10)  # looking must not slow learning
         if cfg.with_parent:
             threading.Thread(target=_wait_for_parent, daemon=True).start()
         # viser tells of every connection, and who started this may listen no more.
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
         view.spin()
-    except KeyboardInterrupt:
-        return 130
-    except (RunError, ValueError, OSError) as error:
+    except OSError as error:
+        complain(f"cannot listen on {cfg.host}: {error}")
+        return 2
+    except ValueError as error:
         complain(str(error))
         return 2
     return 0
@@ -80,13 +86,9 @@ def from_command_line(argv: list[str] | None = None) -> ViewConfig:
     return cfg
 
 
-def _leave(number: int, _: FrameType | None) -> None:
-    raise KeyboardInterrupt
-
-
 def _wait_for_parent() -> None:
     sys.stdin.read()
-    signal.raise_signal(signal.SIGTERM)
+    os._exit(0)
 
 
 if __name__ == "__main__":

@@ -32,12 +32,13 @@ class Page:
             text=True,
         )
         self._address: str | None = None
+        self._known = threading.Event()  # the address, or that there will be none
         threading.Thread(target=self._listen, daemon=True).start()
 
     def close(self, ended_well: bool) -> None:
         """End the page; in a terminal, after a run that ended well, only when people are done."""
         with contextlib.suppress(KeyboardInterrupt):
-            if self._terminal and ended_well and self._address is not None:
+            if self._terminal and ended_well and self._known.wait(30) and self._address:
                 say(f"the page stays until Ctrl-C: {self._address}")
                 self._process.wait()
         self._process.terminate()
@@ -47,9 +48,13 @@ class Page:
     def _listen(self) -> None:
         assert self._process.stdout is not None
         for line in self._process.stdout:
-            if line.startswith("view: "):
-                say(line.strip())
-                if self._address is None:
-                    self._address = line.split()[1]
-            elif line.startswith("error: "):
-                complain(line.removeprefix("error: ").strip())
+            # Nobody may read our output any more; the page's must be read on, lest it block.
+            with contextlib.suppress(OSError, ValueError):
+                if line.startswith("view: "):
+                    if self._address is None:
+                        self._address = line.split()[1]
+                        self._known.set()
+                    say(line.strip())
+                elif line.startswith("error: "):
+                    complain(line.removeprefix("error: ").strip())
+        self._known.set()

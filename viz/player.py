@@ -15,8 +15,6 @@ from goalgan_bt.learner import Learner
 from goalgan_bt.record import RunError
 from goalgan_bt.train import make_env
 
-MOST = 128  # goals tried at once
-
 
 @dataclass(frozen=True)
 class Attempt:
@@ -53,8 +51,8 @@ class Player:
         torch.set_num_threads(1)  # the trainer needs the cores
         self._folder = folder
         cfg = replace(config.load(folder), threads=1)
-        self.env = make_env(cfg, MOST)
-        self._learner = Learner(self.env, replace(cfg, rollout=cfg.rollout))
+        self.env = make_env(cfg, len(make_env(cfg, 1).test_goals()))
+        self._learner = Learner(self.env, cfg)
         self._stamp: int | None = None
         self.rng = np.random.default_rng(seed)
 
@@ -84,7 +82,7 @@ class Player:
         """Try each goal once from the start with the stochastic policy.
 
         Args:
-            goals: (n, goal_dim) metres, at most `MOST` of them.
+            goals: (n, goal_dim) metres, at most as many as there are test goals.
         """
         env, policy, n = self.env, self._learner.policy, len(goals)
         noise = torch.Generator().manual_seed(int(self.rng.integers(2**31)))

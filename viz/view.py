@@ -19,7 +19,7 @@ from goalgan_bt.config import ConfigError
 from goalgan_bt.envs.maze import FloatArray
 from goalgan_bt.viz.body import Bodies
 from goalgan_bt.viz.curves import Curves
-from goalgan_bt.viz.player import MOST, Attempt, Player
+from goalgan_bt.viz.player import Attempt, Player
 from goalgan_bt.viz.run import Frame, Run, number, success
 from goalgan_bt.viz.scene import LAYERS, Scene, legend
 
@@ -182,6 +182,8 @@ class View:
     def _serve(self, request: str, value: Any, now: float) -> None:
         if request == "slider":
             self._show(int(value))
+        elif request == "download":
+            self._download(value)
         elif request == "layer":
             for scene in self._scenes:
                 scene.show(value[0], bool(value[1]))
@@ -195,7 +197,7 @@ class View:
                 return
             assert self._player is not None
             env = self._player.env
-            goals = env.test_goals()[:MOST]
+            goals = env.test_goals()
             if request == "goal":
                 goals = np.zeros((1, env.goal_dim))
                 goals[0, :2] = value
@@ -264,7 +266,7 @@ class View:
         with tabs.add_tab("About"):
             gui.add_markdown(about())
             download = gui.add_button("This report as CSV")
-            download.on_click(self._download)
+            download.on_click(lambda event: self._ask("download", event.client))
             gui.add_markdown("### Settings\n\n" + settings_table(self.runs[0].settings))
 
     def _layer_switched(self, name: str, event: Any) -> None:
@@ -278,11 +280,13 @@ class View:
     def _stop_following(self) -> None:
         self._follow.value = False
 
-    def _download(self, event: Any) -> None:
+    def _download(self, client: viser.ClientHandle | None) -> None:
         run = self.runs[0]
-        frame = run.frame(run.iterations[self._shown]) if self._shown is not None else None
-        if frame is not None and event.client is not None:
-            event.client.send_file_download("coverage.csv", as_csv(frame))
+        if client is None or self._shown is None or self._shown >= len(run.iterations):
+            return
+        frame = run.frame(run.iterations[self._shown])
+        if frame is not None:
+            client.send_file_download("coverage.csv", as_csv(frame))
 
     # Words.
 
