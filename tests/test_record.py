@@ -36,6 +36,9 @@ def test_a_resumed_record_drops_what_came_after_its_checkpoint(tmp_path):
     for i in range(1, 6):
         records.metrics(row(i))
         records.frame(i, goals=np.zeros((1, 2)))
+    with pytest.raises(RunError, match="by another process"):
+        Record(tmp_path, iteration=3)
+    records.close("stopped early")
     resumed = Record(tmp_path, iteration=3)
     resumed.metrics(row(4, new=1.0))
     assert [r["iteration"] for r in cells(tmp_path)] == ["1", "2", "3", "4"]
