@@ -125,6 +125,10 @@ class Maze:
         grid = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)
         return (self.cell_centres()[:, None] + grid).reshape(-1, 2)
 
+    def tile_side(self, tiles: int) -> float:
+        """The side of so many tiles over the free cells, metres (see `tiles`)."""
+        return self.cell_size / max(1, round(float(np.sqrt(tiles / self.free.sum()))))
+
     def sample_free(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Points drawn uniformly from the free area, (n, 2), metres."""
         centres = self.cell_centres()

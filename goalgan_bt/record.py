@@ -133,7 +133,7 @@ class Record:
             arrays: goals (n, goal_dim), success (n,) estimated, label (n,) -1 too hard,
                 0 intermediate, 1 too easy, replayed (n,) bool; replay (m, goal_dim);
                 traces (L, k, goal_dim) with NaN after a trace stopped, trace_goals (k, goal_dim);
-                paths (T, n, goal_dim) where simulations went, NaN where an episode ended;
+                paths (T, n, goal_dim) where simulations went, NaN where another episode began;
                 test_goals (K, goal_dim), estimate (K,) of their success, and coverage (K,)
                 measured, NaN where this report has none.
         """

@@ -8,15 +8,11 @@ import viser
 from viser import uplot
 
 from goalgan_bt.envs.maze import FloatArray
+from goalgan_bt.viz.published import PUBLISHED
 from goalgan_bt.viz.run import Run
 
 MOST = 400  # points of a curve that are sent to the page
 COLOURS = ("#3b7dd8", "#e8871e", "#4aa564", "#c2416b", "#8a63c9", "#7a7a7a")
-# The coverage that was published last for each environment (Goyal et al. 2019, figures 5 and 6).
-PUBLISHED = {
-    "ant_umaze": (("Goal GAN, 137M steps", 0.63), ("recall traces, 77M steps", 0.64)),
-    "point_umaze": (("Goal GAN, 6M steps", 0.78), ("recall traces, 4M steps", 0.96)),
-}
 
 
 @dataclass(frozen=True)
@@ -102,7 +98,10 @@ class Curves:
             self._published = PUBLISHED.get(runs[0].env, ())
             for plot in PLOTS:
                 names = [name for _, name in plot.curves]
-                extra = [name for name, _ in self._published] if plot is PLOTS[0] else []
+                extra = [
+                    f"{line.method}, {line.last[0] / 1e6:.0f}M steps"
+                    for line in (self._published if plot is PLOTS[0] else ())
+                ]
                 self._handles.append(_add(gui, plot.title, self._data(plot), names, extra))
 
     def refresh(self) -> None:
@@ -116,7 +115,7 @@ class Curves:
     def _data(self, plot: Plot) -> tuple[FloatArray, ...]:
         data = series(self._runs[0], plot)
         if plot is PLOTS[0]:
-            data += tuple(np.full(len(data[0]), level) for _, level in self._published)
+            data += tuple(np.full(len(data[0]), line.last[1]) for line in self._published)
         return data
 
     def _compared(self) -> tuple[FloatArray, ...]:

@@ -10,22 +10,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from goalgan_bt import record
-from goalgan_bt.viz.run import maze_of
+from goalgan_bt.viz.published import PUBLISHED
+from goalgan_bt.viz.run import maze_of, success
 
 # Red (never reached) over pale yellow to blue (mastered): readable for colour-blind people.
 COLOURS = "RdYlBu"
 LABELS = {-1: ("too hard", "#a50026"), 0: ("intermediate", "#111111"), 1: ("too easy", "#4575b4")}
-# Goal GAN and Goal GAN + recall traces, Ant U-maze (Goyal et al. 2019): coverage, steps.
-PUBLISHED = {
-    "ant_umaze": [
-        ("Goal GAN (published)", [(2.5e6, 0.20), (45e6, 0.48), (137.5e6, 0.63)]),
-        ("+ recall traces (published)", [(2.5e6, 0.22), (28e6, 0.48), (77.5e6, 0.64)]),
-    ],
-    "point_umaze": [
-        ("Goal GAN (published)", [(0.5e6, 0.20), (3e6, 0.68), (6e6, 0.78)]),
-        ("+ recall traces (published)", [(0.5e6, 0.30), (3e6, 0.78), (4e6, 0.96)]),
-    ],
-}
 
 
 def coverage_curve(ax: Axes, folders: list[Path]) -> None:
@@ -46,8 +36,9 @@ def coverage_curve(ax: Axes, folders: list[Path]) -> None:
         ax.plot(steps, coverage, color=f"C{i}", label=folder.name, marker=".", markersize=4)
         names[folder.name.split("-")[0]] = None
     for name in names:
-        for (label, points), grey in zip(PUBLISHED.get(name, []), ("0.65", "0.35"), strict=False):
-            steps, coverage = zip(*points, strict=True)
+        for line, grey in zip(PUBLISHED.get(name, ()), ("0.65", "0.35"), strict=False):
+            steps, coverage = zip(*line.points, strict=True)
+            label = f"{line.method} (published)"
             ax.plot(steps, coverage, "--", color=grey, marker="o", markersize=3, label=label)
             ax.set_xscale("log")
     ax.set(xlabel="environment steps of training", ylabel="coverage", ylim=(0, 1))
@@ -76,11 +67,10 @@ def coverage_map(ax: Axes, folder: Path, frame: Path, goals: bool = True) -> Any
     if maze is None:
         raise record.RunError(f"{folder} has no maze to draw: only its curve can be plotted")
     arrays = record.read_frame(frame)
-    measured = not np.isnan(arrays["coverage"]).all()
-    rate = arrays["coverage"] if measured else arrays["estimate"]
+    rate, measured = success(arrays)
     tiles = arrays["test_goals"]
     ax.set_facecolor("#55595f")
-    side = maze.cell_size / np.sqrt(len(tiles) / len(maze.cell_centres()))
+    side = maze.tile_side(len(tiles))
     image = ax.scatter([], [], c=[], cmap=COLOURS, vmin=0, vmax=1)
     for (x, y), value in zip(tiles, rate, strict=True):
         colour = image.to_rgba(value)
@@ -104,7 +94,7 @@ def measured_frames(folder: Path) -> list[Path]:
     return [
         frame
         for frame in record.frames(folder)
-        if not np.isnan(record.read_frame(frame)["coverage"]).all()
+        if success(record.read_frame(frame))[1]
     ]
 
 

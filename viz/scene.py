@@ -76,8 +76,8 @@ def tile_image(maze: Maze, tiles: FloatArray, rate: FloatArray) -> NDArray[np.ui
         rate: (K,) success.
     """
     rows, columns = maze.free.shape
-    per_cell = max(1, round(np.sqrt(len(tiles) / maze.free.sum())))
-    side = maze.cell_size / per_cell
+    side = maze.tile_side(len(tiles))
+    per_cell = round(maze.cell_size / side)
     image = np.zeros((rows * per_cell, PIXELS, columns * per_cell, PIXELS, 4), dtype=np.uint8)
     index = np.floor((tiles - maze.low) / side).astype(int)
     c = np.clip(index[:, 0], 0, columns * per_cell - 1)
@@ -176,9 +176,7 @@ class Scene:
         circle = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         few = goals[:1, None, :2] if len(goals) == 1 else np.empty((0, 1, 2))
         points, _ = segments(np.swapaxes(few + circle, 0, 1))
-        self._scene.add_line_segments(
-            self._name("body", "goal"), points, MARK, thickness=3.0, thickness_units="screen"
-        )
+        self._lines("body", points, MARK, 3.0, "goal")
 
     def _name(self, layer: str, node: str = "node") -> str:
         return f"{self._prefix}/{layer}/{node}"
@@ -260,9 +258,10 @@ class Scene:
         points: NDArray[np.float32],
         colour: NDArray[np.uint8] | tuple[int, int, int],
         width: float,
+        node: str = "node",
     ) -> None:
         self._scene.add_line_segments(
-            self._name(layer), points, colour, thickness=width, thickness_units="screen"
+            self._name(layer, node), points, colour, thickness=width, thickness_units="screen"
         )
 
 
