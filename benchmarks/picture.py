@@ -12,28 +12,19 @@ import mujoco
 import numpy as np
 from matplotlib.figure import Figure
 
-from goalgan_bt import checkpoint, config
-from goalgan_bt.learner import Learner
-from goalgan_bt.train import make_env
 from goalgan_bt.viz import pictures
+from goalgan_bt.viz.player import Player
 
 
 def walk(folder: Path, goal: tuple[float, float], every: int) -> np.ndarray:
     """The Ant at several moments of one deterministic episode, in one image from above."""
-    cfg = config.load(folder)
-    env = make_env(cfg, 1)
-    learner = Learner(env, cfg)
-    checkpoint.load(learner, folder)
-    only = np.array([0])
-    env.reset(only, np.array([goal]))
-    obs, states, done = env.observe(only), [env.start_state], False
-    while not done:
-        step = env.step(only, learner.policy.act(obs, None))
-        obs, done = step.obs, bool(step.terminated[0] or step.truncated[0])
-        states.append(step.states[0])
+    player = Player(folder)
+    if not player.take_newest():
+        raise SystemExit(f"error: {folder} has no policy to show")
+    states = player.attempt(np.array([goal]), deterministic=True).states[:, 0]
     poses = [*states[: -every // 2 : every], states[-1]]
 
-    model = env.model
+    model = player.model
     model.vis.global_.offwidth = model.vis.global_.offheight = 900
     data = mujoco.MjData(model)
     camera = mujoco.MjvCamera()

@@ -1,10 +1,14 @@
 """Checkpoints: the whole training state in one file, written atomically, read without pickles."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from goalgan_bt.learner import Learner
+from goalgan_bt.policy import GaussianPolicy
 from goalgan_bt.record import RunError, write_atomically
 
 
@@ -20,11 +24,33 @@ def load(learner: Learner, folder: Path) -> None:
     Raises:
         RunError: if there is none, or it is damaged or of other settings.
     """
+    with _saved(folder) as state:
+        learner.load_state_dict(state)
+
+
+def load_policy(policy: GaussianPolicy, folder: Path) -> int:
+    """Put only the policy of a run's `checkpoint.pt` into one of the same settings.
+
+    Returns:
+        The iteration that made it.
+
+    Raises:
+        RunError: as `load`.
+    """
+    with _saved(folder) as state:
+        policy.load_state_dict(state["modules"]["policy"])
+        iteration = int(state["iteration"])
+    return iteration
+
+
+@contextmanager
+def _saved(folder: Path) -> Iterator[dict[str, Any]]:
+    """What `save` wrote; whatever goes wrong while it is read and taken over is a `RunError`."""
     path = folder / "checkpoint.pt"
     if not path.is_file():
         raise RunError(f"{folder} has no checkpoint.pt to resume from: start a new run")
     try:
-        learner.load_state_dict(torch.load(path, weights_only=True))
+        yield torch.load(path, weights_only=True)
     except Exception as error:  # torch raises many kinds for a damaged file
         words = str(error).strip().splitlines() or [type(error).__name__]
         reason = words[0].split(". ")[0][:160]

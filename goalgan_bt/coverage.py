@@ -5,13 +5,14 @@ the centres of 0.5 m tiles: 112 in the U-maze), coverage is the mean success. He
 training horizon and the training's definition of success.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from goalgan_bt.envs.batch import GoalEnv
+from goalgan_bt.envs.batch import GoalEnv, Ids, Step
 from goalgan_bt.envs.maze import FloatArray
 from goalgan_bt.policy import GaussianPolicy
 
@@ -33,6 +34,30 @@ class Success(NamedTuple):
     steps: int
 
 
+def attempts(
+    env: GoalEnv, policy: GaussianPolicy, goals: FloatArray, noise: torch.Generator | None
+) -> Iterator[tuple[Ids, Step]]:
+    """Try goals side by side, once each from the start, until the last episode has ended.
+
+    Args:
+        env: simulations for this purpose, at least as many as goals.
+        policy: pi.
+        goals: (n, goal_dim).
+        noise: draws actions; None for the deterministic policy.
+
+    Yields:
+        After each action the goals, as indices, whose episodes it moved on, and what it gave.
+    """
+    active = np.arange(len(goals))
+    env.reset(active, goals)
+    obs = env.observe(active)
+    while len(active):
+        step = env.step(active, policy.act(obs, noise))
+        yield active, step
+        going = ~(step.terminated | step.truncated)
+        active, obs = active[going], step.obs[going]
+
+
 def success_rate(
     env: GoalEnv,
     policy: GaussianPolicy,
@@ -49,18 +74,11 @@ def success_rate(
         rollouts: episodes per goal.
         noise: draws actions; None for the deterministic policy.
     """
-    attempts = np.repeat(np.arange(len(goals)), rollouts)
-    reached = np.zeros(len(attempts))
+    tried = np.repeat(goals, rollouts, axis=0)
+    reached = np.zeros(len(tried))
     steps = 0
-    for begin in range(0, len(attempts), env.num_envs):
-        chunk = attempts[begin : begin + env.num_envs]
-        active = np.arange(len(chunk))
-        env.reset(active, goals[chunk])
-        obs = env.observe(active)
-        while len(active):
-            step = env.step(active, policy.act(obs, noise))
+    for begin in range(0, len(tried), env.num_envs):
+        for active, step in attempts(env, policy, tried[begin : begin + env.num_envs], noise):
             steps += len(active) * env.action_repeat
             reached[begin + active] = step.rewards
-            going = ~(step.terminated | step.truncated)
-            active, obs = active[going], step.obs[going]
     return Success(reached.reshape(len(goals), rollouts).mean(axis=1), steps)

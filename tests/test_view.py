@@ -267,7 +267,7 @@ def test_without_a_policy_it_says_so(folder):
 def test_the_body_acts_with_the_noise_that_was_recorded(folder):
     player = Player(folder)
     assert player.take_newest()
-    policy = player._learner.policy
+    policy = player._policy
     std = float(policy(torch.zeros(1, player.env.obs_dim))[1].exp().mean())
     assert np.isclose(std, Run(folder).column("rollout/std")[-1], rtol=1e-4)
 

@@ -9,9 +9,10 @@ import numpy as np
 import torch
 
 from goalgan_bt import checkpoint, config
+from goalgan_bt.coverage import attempts
 from goalgan_bt.envs.batch import MujocoEnv
 from goalgan_bt.envs.maze import BoolArray, FloatArray
-from goalgan_bt.learner import Learner
+from goalgan_bt.policy import GaussianPolicy
 from goalgan_bt.record import RunError
 from goalgan_bt.train import make_env
 
@@ -43,6 +44,9 @@ class Player:
         folder: the run folder.
         seed: of the goals that it picks by itself and of the policy's noise.
 
+    Attributes:
+        env: its simulations; iteration: of the policy, 0 while there is none.
+
     Raises:
         ConfigError: if the run's settings cannot be read.
     """
@@ -52,8 +56,9 @@ class Player:
         self._folder = folder
         cfg = replace(config.load(folder), threads=1)
         self.env = make_env(cfg, len(make_env(cfg, 1).test_goals()))
-        self._learner = Learner(self.env, cfg)
+        self._policy = GaussianPolicy(self.env.obs_dim, self.env.act_dim, cfg.policy)
         self._stamp: int | None = None
+        self.iteration = 0
         self.rng = np.random.default_rng(seed)
 
     @property
@@ -61,45 +66,35 @@ class Player:
         """The MuJoCo model, or None for the N-dimensional point mass."""
         return self.env.model if isinstance(self.env, MujocoEnv) else None
 
-    @property
-    def iteration(self) -> int:
-        """Of the policy, 0 while there is none."""
-        return 0 if self._stamp is None else self._learner.iteration
-
     def take_newest(self) -> bool:
         """Load the checkpoint if it is new and whole; whether there is a policy to play."""
         path = self._folder / "checkpoint.pt"
         try:
             stamp = os.stat(path).st_mtime_ns
             if stamp != self._stamp:
-                checkpoint.load(self._learner, self._folder)
+                self.iteration = checkpoint.load_policy(self._policy, self._folder)
                 self._stamp = stamp
         except (OSError, RunError):
             pass  # none yet, or another version: the last one will do
         return self._stamp is not None
 
-    def attempt(self, goals: FloatArray) -> Attempt:
-        """Try each goal once from the start with the stochastic policy.
+    def attempt(self, goals: FloatArray, deterministic: bool = False) -> Attempt:
+        """Try each goal once from the start.
 
         Args:
             goals: (n, goal_dim) metres, at most as many as there are test goals.
+            deterministic: without the policy's noise.
         """
-        env, policy, n = self.env, self._learner.policy, len(goals)
-        noise = torch.Generator().manual_seed(int(self.rng.integers(2**31)))
-        active = np.arange(n)
-        env.reset(active, goals)
-        obs = env.observe(active)
-        states = [env.read_states(np.arange(n))]
+        env, n = self.env, len(goals)
+        seed = int(self.rng.integers(2**31))
+        noise = None if deterministic else torch.Generator().manual_seed(seed)
+        states = [np.tile(env.start_state, (n, 1))]
         reached, ends = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
-        while len(active):
-            step = env.step(active, policy.act(obs, noise))
-            latest = states[-1].copy()
-            latest[active] = step.states
-            states.append(latest)
+        for active, step in attempts(env, self._policy, goals, noise):
+            states.append(states[-1].copy())
+            states[-1][active] = step.states
             ends[active] = len(states) - 1
             reached[active] = step.rewards > 0
-            going = ~(step.terminated | step.truncated)
-            active, obs = active[going], step.obs[going]
         return Attempt(goals, np.array(states), ends, reached, env.dt * env.action_repeat)
 
     def some_goal(self) -> FloatArray:
