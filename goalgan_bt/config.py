@@ -1,7 +1,5 @@
 """The settings of a run: one dataclass per concept, composed here, a preset per environment."""
 
-import contextlib
-import io
 import json
 import math
 import os
@@ -12,10 +10,9 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import tyro
-
 from goalgan_bt import envs
 from goalgan_bt.backtracking import BacktrackingConfig
+from goalgan_bt.command_line import UsageError, parse
 from goalgan_bt.coverage import CoverageConfig
 from goalgan_bt.gan import GanConfig
 from goalgan_bt.goals import GoalsConfig
@@ -29,7 +26,7 @@ from goalgan_bt.trpo import TrpoConfig
 FIXED = ("env", "seed", "map", "dim", "horizon", "action_repeat", "integrator", "out")
 
 
-class ConfigError(ValueError):
+class ConfigError(UsageError):
     """Settings that cannot be run; the message says which and what to do."""
 
 
@@ -220,7 +217,8 @@ def from_command_line(argv: list[str] | None = None) -> Config:
     With `--resume RUN` the run's own settings take the preset's place.
 
     Raises:
-        ConfigError: for an unknown flag, a bad value or a folder that is no run.
+        UsageError: for an unknown flag or a value of the wrong kind.
+        ConfigError: for a bad value or a folder that is no run.
         SystemExit: after `--help`.
     """
     argv = sys.argv[1:] if argv is None else argv
@@ -229,15 +227,7 @@ def from_command_line(argv: list[str] | None = None) -> Config:
         default = load(Path(run))
     elif (env := _value_of(argv, "--env")) is not None:
         default = preset(env)
-    printed = io.StringIO()
-    try:
-        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-            cfg = tyro.cli(Config, default=default, args=argv, prog="python -m goalgan_bt.train")
-    except SystemExit as stop:
-        if not stop.code:  # --help
-            sys.stdout.write(printed.getvalue())
-            raise
-        raise ConfigError(_one_line(printed.getvalue())) from None
+    cfg = parse(Config, argv, "python -m goalgan_bt.train", default)
     check(cfg)
     if run is not None:
         for name in FIXED:
@@ -299,11 +289,3 @@ def _value_of(argv: list[str], flag: str) -> str | None:
         elif word.startswith(flag + "="):
             value = word.split("=", 1)[1]
     return value
-
-
-def _one_line(text: str) -> str:
-    """What tyro prints in a box, without the box and without what repeats."""
-    words = "".join(" " if c in "╭╮╰╯│─━┃\n" else c for c in text).split()
-    line = " ".join(word for word in words if set(word) != {"-"})
-    line = line.removeprefix("Parsing error ").removeprefix("Unrecognized options ")
-    return line.split(" For full helptext")[0][:300] + "; --help lists every setting"

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import tyro
 
+from goalgan_bt.command_line import UsageError, parse
 from goalgan_bt.progress import complain, say
 from goalgan_bt.record import RunError
 
@@ -27,10 +28,10 @@ class PlotConfig:
 
 def main() -> int:
     """The command line; returns the exit code."""
-    cfg = tyro.cli(PlotConfig, prog="python -m goalgan_bt.plot", description=__doc__)
     try:
+        cfg = parse(PlotConfig, None, "python -m goalgan_bt.plot")
         if not cfg.runs or cfg.maps < 1:
-            raise RunError("name at least one run folder, and ask for at least one map")
+            raise UsageError("name at least one run folder, and ask for at least one map")
         try:
             from goalgan_bt.viz import pictures
         except ImportError:

@@ -36,6 +36,7 @@ from torch import Tensor
 from goalgan_bt import checkpoint, config, envs, record, trpo
 from goalgan_bt.advantage import gae
 from goalgan_bt.backtracking import recall_traces
+from goalgan_bt.command_line import UsageError
 from goalgan_bt.config import Config
 from goalgan_bt.coverage import success_rate
 from goalgan_bt.decoder import decode
@@ -381,7 +382,7 @@ def main() -> int:
             folder = cfg.resume or record.create_folder(cfg.out, env.name, cfg.seed)
             if cfg.resume is None:
                 record.write_meta(folder, env.maze)
-                config.save(cfg, folder)
+                config.save(cfg, folder)  # the page reads it before training begins
             say(f"run folder: {folder}")
             if cfg.viz == "browser":
                 page = Page(folder, cfg.viz_host, cfg.viz_port)
@@ -397,7 +398,7 @@ def main() -> int:
             complain(f"standard output was closed{how_to_go_on(folder)}")
         elif isinstance(error, FileNotFoundError) and folder is not None and not folder.exists():
             complain(f"the run folder {folder} has vanished: start again")
-        elif isinstance(error, (config.ConfigError, record.RunError, MapError, OSError)):
+        elif isinstance(error, (UsageError, record.RunError, MapError, OSError)):
             complain(str(error))
         else:
             raise

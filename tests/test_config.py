@@ -3,6 +3,7 @@ import json
 import pytest
 
 from goalgan_bt import config, envs
+from goalgan_bt.command_line import UsageError
 from goalgan_bt.config import ConfigError
 
 
@@ -49,7 +50,7 @@ def test_the_command_line_overrides_the_preset(env):
     ],
 )
 def test_bad_flags_are_one_clear_line(flags, message):
-    with pytest.raises(ConfigError) as error:
+    with pytest.raises(UsageError) as error:
         config.from_command_line(flags)
     assert message in str(error.value)
     assert "\n" not in str(error.value)

@@ -20,7 +20,7 @@ from goalgan_bt.viz.curves import joined, thinned
 from goalgan_bt.viz.player import Player
 from goalgan_bt.viz.run import Run, success
 from goalgan_bt.viz.scene import colours, segments, tile_image
-from goalgan_bt.viz.view import View, as_csv, open_runs, report_at
+from goalgan_bt.viz.view import View, as_csv, report_at
 
 TINY = (
     "--env point_umaze --iterations 4 --report-every 1 --rollout.num-envs 16 --rollout.steps 20 "
@@ -46,7 +46,7 @@ def folder(trained, tmp_path):
 
 @pytest.fixture
 def view(folder):
-    view = View(open_runs([folder]), port=0)
+    view = View([Run(folder)], port=0)
     yield view
     view.close()
 
@@ -215,7 +215,7 @@ def test_frames_of_an_older_version_are_drawn_as_far_as_they_go(folder):
     record.Record(folder, 4).frame(5, **few)
     record.Record(folder, 5).frame(6, coverage=np.zeros(3))
     record.Record(folder, 6).frame(7, **{**few, "coverage": np.full(112, np.nan)})
-    view = View(open_runs([folder]), port=0)
+    view = View([Run(folder)], port=0)
     for index in range(7):
         view._show(index)
     view.close()
@@ -230,7 +230,7 @@ def test_the_page_outlives_its_folder(view, folder):
 
 
 def test_several_runs_stand_side_by_side(trained, folder):
-    view = View(open_runs([trained, folder]), port=0)
+    view = View([Run(trained), Run(folder)], port=0)
     assert node(view, "/run1").position[0] > node(view, "/run0").position[0] + 6
     view.tick(time.monotonic())
     view.close()
@@ -257,7 +257,7 @@ def test_a_click_into_a_wall_is_answered(view):
 
 def test_without_a_policy_it_says_so(folder):
     (folder / "checkpoint.pt").unlink()
-    view = View(open_runs([folder]), port=0)
+    view = View([Run(folder)], port=0)
     view._ask("all", None)
     view.tick(time.monotonic())
     assert "no policy to play" in view._outcome.content

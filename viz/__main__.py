@@ -8,8 +8,6 @@ if __name__ == "__main__":  # a page has nothing to lose: it goes at once, witho
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
     signal.signal(signal.SIGTERM, lambda *_: os._exit(2))
 
-import contextlib
-import io
 import socket
 import threading
 from dataclasses import dataclass
@@ -17,6 +15,7 @@ from pathlib import Path
 
 import tyro
 
+from goalgan_bt.command_line import UsageError, parse
 from goalgan_bt.progress import complain, say
 
 
@@ -39,11 +38,12 @@ def main() -> int:
     try:
         cfg = from_command_line()
         # Only now: this imports torch and MuJoCo, and --help shall not wait for them.
-        from goalgan_bt.viz.view import View, open_runs
+        from goalgan_bt.viz.run import Run
+        from goalgan_bt.viz.view import View
 
         family = socket.AF_INET6 if ":" in cfg.host else socket.AF_INET
         socket.create_server((cfg.host, 0), family=family).close()  # can we listen there?
-        view = View(open_runs(list(cfg.runs)), cfg.host, cfg.port)
+        view = View([Run(folder) for folder in cfg.runs], cfg.host, cfg.port)
         busy = cfg.port not in (0, view.server.get_port())
         say(f"view: {view.address}" + (f" (port {cfg.port} was busy)" if busy else ""))
         if cfg.host in ("0.0.0.0", "::"):
@@ -67,22 +67,14 @@ def from_command_line(argv: list[str] | None = None) -> ViewConfig:
     """What the command line asks for.
 
     Raises:
-        ValueError: if it makes no sense.
+        UsageError: if it makes no sense.
         SystemExit: after `--help`.
     """
-    printed = io.StringIO()
-    try:
-        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-            cfg = tyro.cli(ViewConfig, args=argv, prog="python -m goalgan_bt.viz")
-    except SystemExit as stop:
-        if not stop.code:
-            sys.stdout.write(printed.getvalue())
-            raise
-        raise ValueError("what to show? python -m goalgan_bt.viz RUN; --help tells more") from None
+    cfg = parse(ViewConfig, argv, "python -m goalgan_bt.viz")
     if not cfg.runs:
-        raise ValueError("name at least one run folder: python -m goalgan_bt.viz RUN")
+        raise UsageError("name at least one run folder: python -m goalgan_bt.viz RUN")
     if not 0 <= cfg.port <= 65535:
-        raise ValueError(f"--port must be between 0 and 65535, not {cfg.port}")
+        raise UsageError(f"--port must be between 0 and 65535, not {cfg.port}")
     return cfg
 
 

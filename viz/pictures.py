@@ -91,11 +91,7 @@ def coverage_map(ax: Axes, folder: Path, frame: Path, goals: bool = True) -> Any
 
 def measured_frames(folder: Path) -> list[Path]:
     """The frames that hold a measured coverage, oldest first."""
-    return [
-        frame
-        for frame in record.frames(folder)
-        if success(record.read_frame(frame))[1]
-    ]
+    return [frame for frame in record.frames(folder) if success(record.read_frame(frame))[1]]
 
 
 def overview(folders: list[Path], maps: int = 4) -> Figure:

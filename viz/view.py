@@ -9,7 +9,6 @@ import io
 import queue
 import time
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -43,20 +42,21 @@ class View:
         with contextlib.redirect_stdout(io.StringIO()):  # viser's banner
             self.server = viser.ViserServer(host=host, port=port, label="goalgan_bt")
         self._requests: queue.Queue[tuple[str, Any]] = queue.Queue(maxsize=100)
-        self._scenes = []
-        for i, run in enumerate(runs):
-            box = box_of(run)
-            spread = GAP * max(float((box[1] - box[0])[:2].max()), 1.0)
-            self._scenes.append(
-                Scene(self.server, run.maze, box, f"/run{i}", offset=(i * spread, 0.0))
-            )
+        boxes = [box_of(run) for run in runs]
+        # Metres from one maze to the next, the same for all: GAP sides of the largest.
+        self._spread = GAP * max(float(np.ptp(box[:, :2], axis=0).max()) for box in boxes)
+        self._scenes = [
+            Scene(self.server, run.maze, box, f"/run{i}", offset=(i * self._spread, 0.0))
+            for i, (run, box) in enumerate(zip(runs, boxes, strict=True))
+        ]
+        self._drawn: list[Frame | None] = [None] * len(runs)  # the frame in each scene
         self._shown: int | None = None  # index of the report on show
         self._playing_since = 0.0
         self._player: Player | None = None
         self._bodies: Bodies | None = None
         self._attempt: Attempt | None = None
         self._attempt_began = 0.0
-        self._asked: FloatArray | None = None
+        self._asked = False  # whether the attempt is one that somebody asked for
         self._last_look = 0.0
         self._place_camera()
         self._build_panel()
@@ -86,7 +86,7 @@ class View:
         while not self._requests.empty():
             # A browser may send any value for any control: nonsense is dropped.
             with contextlib.suppress(TypeError, ValueError, OverflowError):
-                self._serve(*self._requests.get(), now)
+                self._serve(*self._requests.get())
         if now - self._last_look >= LOOK_EVERY:
             self._look()
             self._last_look = now
@@ -111,24 +111,25 @@ class View:
                 self._slider.value = last
             self._curves.refresh()
         if self._follow.value or self._shown is None:
-            self._show(len(self.runs[0].iterations) - 1, force=any(news))
+            self._show(len(self.runs[0].iterations) - 1)
         self._status.content = self._describe()
 
-    def _show(self, index: int, force: bool = False) -> None:
+    def _show(self, index: int) -> None:
         """Draw the report with that index (of the first run) and what the others had by then."""
         run = self.runs[0]
-        if not run.iterations or (index == self._shown and not force):
+        if not run.iterations:
             return
         index = int(np.clip(index, 0, len(run.iterations) - 1))
         steps = number(run.row_of(run.iterations[index]).get("steps/train"))
         with self.server.atomic():
             for i, (other, scene) in enumerate(zip(self.runs, self._scenes, strict=True)):
                 frame = other.frame(run.iterations[index] if i == 0 else report_at(other, steps))
-                if frame is not None:
-                    try:
-                        scene.draw(frame)
-                    except (KeyError, ValueError, IndexError, TypeError):
-                        continue  # of another version, or damaged: the last picture stays
+                if frame is None or frame is self._drawn[i]:
+                    continue
+                # A frame of another version, or damaged: what it lacks keeps the last picture.
+                with contextlib.suppress(KeyError, ValueError, IndexError, TypeError):
+                    scene.draw(frame)
+                self._drawn[i] = frame
         self._shown = index
         self._caption.content = self._describe_report(index)
 
@@ -147,19 +148,18 @@ class View:
     # The body, and the goals that people set.
 
     def _play_body(self, now: float) -> None:
-        if len(self.runs) > 1 or (not self._scenes[0].visible("body") and self._asked is None):
+        if len(self.runs) > 1 or not (self._scenes[0].visible("body") or self._asked):
             return
         if self._attempt is None or now - self._attempt_began > self._attempt.seconds + PAUSE:
-            if self._attempt is not None and self._asked is not None:
-                self._asked = None
+            self._asked = False
             if not self._ready():
                 return
             assert self._player is not None
-            self._begin(self._player.some_goal(), now)
+            self._begin(self._player.some_goal())
         assert self._attempt is not None and self._bodies is not None
         step = max(0, int((now - self._attempt_began) / self._attempt.dt))
         self._bodies.draw(self._attempt.states[min(step, len(self._attempt.states) - 1)])
-        if self._asked is not None:
+        if self._asked:
             self._outcome.content = self._describe_attempt(now)
 
     def _ready(self) -> bool:
@@ -171,7 +171,7 @@ class View:
                 return False
         return self._player.take_newest()
 
-    def _begin(self, goals: FloatArray, now: float) -> None:
+    def _begin(self, goals: FloatArray) -> None:
         assert self._player is not None
         if self._bodies is None:
             self._bodies = Bodies(self.server, self._player.model, "/run0/body/points")
@@ -179,7 +179,7 @@ class View:
         self._attempt_began = time.monotonic()
         self._scenes[0].mark(goals, self._player.env.success_radius)
 
-    def _serve(self, request: str, value: Any, now: float) -> None:
+    def _serve(self, request: str, value: Any) -> None:
         if request == "slider":
             self._show(int(value))
         elif request == "download":
@@ -204,9 +204,9 @@ class View:
                 if not env.feasible(goals)[0]:
                     self._outcome.content = "No body can be there: click on a free place."
                     return
-            self._asked = goals
+            self._asked = True
             self._outcome.content = "..."
-            self._begin(goals, now)
+            self._begin(goals)
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
@@ -222,9 +222,10 @@ class View:
 
     def _place_camera(self) -> None:
         first, last = self._scenes[0], self._scenes[-1]
-        size = first.size * (1 + GAP * (len(self._scenes) - 1))
+        row = self._spread * (len(self._scenes) - 1)
+        size = first.size + row
         middle = (first.centre + last.centre) / 2
-        middle[0] += GAP * first.size * (len(self._scenes) - 1) / 2
+        middle[0] += row / 2
         camera = self.server.initial_camera
         right = 0.1 * size  # the panel covers the right of the page
         camera.position = (middle[0] + right, middle[1] - 0.5 * size, 0.92 * size)
@@ -307,12 +308,12 @@ class View:
         return " · ".join(words)
 
     def _describe_attempt(self, now: float) -> str:
-        attempt, asked = self._attempt, self._asked
-        assert attempt is not None and asked is not None and self._player is not None
+        attempt = self._attempt
+        assert attempt is not None and self._player is not None
         done = now - self._attempt_began
         whose = f"Policy of iteration {self._player.iteration:,}. "
-        if len(asked) == 1:
-            x, y = asked[0, :2]
+        if len(attempt.goals) == 1:
+            x, y = attempt.goals[0, :2]
             if done < attempt.seconds:
                 return f"{whose}Goal ({x:.1f}, {y:.1f}): on its way, {done:.1f} s"
             early = attempt.ends[0] * attempt.dt < self._player.env.horizon * self._player.env.dt
@@ -320,7 +321,7 @@ class View:
             return f"{whose}Goal ({x:.1f}, {y:.1f}): **{why}** after {attempt.seconds:.1f} s"
         ended = attempt.ends * attempt.dt <= done
         reached = int((attempt.reached & ended).sum())
-        return f"{whose}All tiles: **{reached} of {len(asked)}** reached, {ended.sum()} ended"
+        return f"{whose}All tiles: **{reached} of {len(ended)}** reached, {ended.sum()} ended"
 
 
 def box_of(run: Run) -> FloatArray:
@@ -369,7 +370,7 @@ def as_csv(frame: Frame) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def settings_table(settings: dict[str, Any], prefix: str = "") -> str:
+def settings_table(settings: dict[str, Any]) -> str:
     """The settings as a markdown table."""
 
     def rows(values: dict[str, Any], prefix: str) -> list[str]:
@@ -382,18 +383,9 @@ def settings_table(settings: dict[str, Any], prefix: str = "") -> str:
                 out.append(f"| {prefix}{name} | {text} |")
         return out
 
-    return "\n".join(["| setting | value |", "|---|---|", *rows(settings, prefix)])
+    return "\n".join(["| setting | value |", "|---|---|", *rows(settings, "")])
 
 
 def about() -> str:
     """What one is looking at."""
     return "\n\n".join(f"**{label}.** {text}" for label, text, _ in LAYERS.values())
-
-
-def open_runs(folders: list[Path]) -> list[Run]:
-    """The runs in those folders.
-
-    Raises:
-        RunError: if one is no run.
-    """
-    return [Run(folder) for folder in folders]

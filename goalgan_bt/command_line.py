@@ -1,0 +1,47 @@
+"""Command lines from dataclasses, whose mistakes end in one line instead of tyro's box."""
+
+import contextlib
+import io
+import sys
+from typing import Any, TypeVar
+
+import tyro
+
+T = TypeVar("T")
+
+
+class UsageError(ValueError):
+    """A command line that makes no sense; the message says which part of it."""
+
+
+def parse(kind: type[T], argv: list[str] | None, prog: str, default: T | None = None) -> T:
+    """What a command line asks for.
+
+    Args:
+        kind: the dataclass of its flags.
+        argv: its words; those of this process if None.
+        prog: how the command is called, for its help.
+        default: values of the flags that are not given; else those of the class.
+
+    Raises:
+        UsageError: for an unknown flag or a bad value.
+        SystemExit: after `--help`.
+    """
+    printed = io.StringIO()
+    defaults: dict[str, Any] = {} if default is None else {"default": default}
+    try:
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+            return tyro.cli(kind, args=argv, prog=prog, **defaults)
+    except SystemExit as stop:
+        if not stop.code:  # --help
+            sys.stdout.write(printed.getvalue())
+            raise
+        raise UsageError(_one_line(printed.getvalue())) from None
+
+
+def _one_line(text: str) -> str:
+    """What tyro prints in a box, without the box and without what repeats."""
+    words = "".join(" " if c in "╭╮╰╯│─━┃\n" else c for c in text).split()
+    line = " ".join(word for word in words if set(word) != {"-"})
+    line = line.removeprefix("Parsing error ").removeprefix("Unrecognized options ")
+    return line.split(" For full helptext")[0][:300] + "; --help lists every setting"
