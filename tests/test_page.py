@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 import pytest
+from conftest import serve
 from PIL import Image
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
@@ -53,16 +54,6 @@ def folder(tmp_path_factory):
     process, folder = train("--total-steps", "300000", out=tmp_path_factory.mktemp("page"))
     process.communicate(timeout=120)
     return folder
-
-
-def serve(folder):
-    process = subprocess.Popen(
-        [sys.executable, "-m", "goalgan_bt.viz", folder, "--port", "0", "--with-parent"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    return process, process.stdout.readline().split()[1]
 
 
 def opened(browser, address):

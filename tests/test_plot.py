@@ -1,34 +1,15 @@
 import shutil
-import subprocess
-import sys
 
 import matplotlib.image
 import pytest
+from conftest import run_module
 
-from goalgan_bt import config, record
-from goalgan_bt.envs import maze as mazes
-from goalgan_bt.train import train
+from goalgan_bt import record
 from goalgan_bt.viz import pictures
 
 
 def plot(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "goalgan_bt.plot", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("runs") / "point_umaze-test-s0"
-    folder.mkdir()
-    flags = "--env point_umaze --iterations 3 --rollout.num-envs 16 --rollout.steps 20 --horizon 40"
-    cfg = config.from_command_line([*flags.split(), "--threads", "1"])
-    record.write_meta(folder, mazes.layout("umaze"))
-    train(cfg, folder)
-    return folder
+    return run_module("plot", *arguments)
 
 
 def test_a_run_becomes_a_picture(folder, tmp_path):

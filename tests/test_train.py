@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from conftest import run_module
 
 from goalgan_bt import checkpoint, config, record
 from goalgan_bt.learner import Learner
@@ -288,12 +289,7 @@ def test_a_full_disk_is_one_line(tmp_path):
 
 
 def test_help_shows_defaults_of_the_preset():
-    done = subprocess.run(
-        [sys.executable, "-m", "goalgan_bt.train", "--env", "point_umaze", "--help"],
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    done = run_module("train", "--env", "point_umaze", "--help")
     assert done.returncode == 0
     assert "4000000" in done.stdout and "--backtracking.trace-length" in done.stdout
 

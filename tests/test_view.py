@@ -1,8 +1,6 @@
 """The page: what it reads, what it draws, what people can do to it."""
 
 import shutil
-import subprocess
-import sys
 import time
 
 import msgspec
@@ -11,37 +9,16 @@ import pytest
 import torch
 import viser
 import websockets.sync.client
+from conftest import run_module, serve
 from viser import _messages
 
-from goalgan_bt import config, record
+from goalgan_bt import record
 from goalgan_bt.envs import maze as mazes
-from goalgan_bt.train import train
 from goalgan_bt.viz.curves import joined, thinned
 from goalgan_bt.viz.player import Player
 from goalgan_bt.viz.run import Run, success
 from goalgan_bt.viz.scene import colours, segments, tile_image
 from goalgan_bt.viz.view import View, as_csv, report_at
-
-TINY = (
-    "--env point_umaze --iterations 4 --report-every 1 --rollout.num-envs 16 --rollout.steps 20 "
-    "--threads 1 --coverage.rollouts 1 --gan.pretrain-steps 20 --gan.steps 5 "
-    "--backtracking.min-transitions 50"
-)
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("runs") / "point_umaze-test-s0"
-    folder.mkdir()
-    record.write_meta(folder, mazes.layout("umaze"))
-    train(config.from_command_line(TINY.split()), folder)
-    return folder
-
-
-@pytest.fixture
-def folder(trained, tmp_path):
-    """A run of one's own to break."""
-    return shutil.copytree(trained, tmp_path / trained.name)
 
 
 @pytest.fixture
@@ -308,15 +285,6 @@ def test_a_foreign_page_changes_no_file_and_ends_nothing(view, folder):
 # The command.
 
 
-def command(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "goalgan_bt.viz", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -327,19 +295,13 @@ def command(*arguments):
     ],
 )
 def test_bad_input_ends_in_one_line_and_code_2(arguments, message):
-    done = command(*arguments)
+    done = run_module("viz", *arguments)
     assert done.returncode == 2 and message in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
 
 
 def test_it_listens_here_only_and_ends_with_its_parent(folder):
-    process = subprocess.Popen(
-        [sys.executable, "-m", "goalgan_bt.viz", folder, "--port", "0", "--with-parent"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    line = process.stdout.readline()
-    assert line.startswith("view: http://127.0.0.1:")
+    process, address = serve(folder)
+    assert address.startswith("http://127.0.0.1:")
     process.stdin.close()
     assert process.wait(timeout=20) == 0
