@@ -43,6 +43,7 @@ def test_the_wheel_is_complete_and_installs_one_package(built):
     ours |= {f"goalgan_bt/envs/{p.name}" for p in (ROOT / "envs").glob("*.py")}
     ours |= {f"goalgan_bt/viz/{p.name}" for p in (ROOT / "viz").glob("*.py")}
     assert ours <= set(names) and "goalgan_bt/py.typed" in names
+    assert "goalgan_bt/viz/export.html" in names
 
 
 def test_the_sdist_holds_what_the_wheel_needs(built):

@@ -29,6 +29,10 @@ class ViewConfig:
     """Where to listen; 0.0.0.0 lets everybody on the network in, without a password."""
     port: int = 8080
     """Port; if it is busy, the next free one is taken and printed. 0 takes any."""
+    export: Path | None = None
+    """Instead of a server, one HTML file that plays a run without any: scene, curves, settings."""
+    movie: Path | None = None
+    """Instead of a server, a .gif or .mp4 of the map as it grows (extras `plots` and `movie`)."""
     with_parent: bool = False
     """End when standard input closes: for a page that another program starts."""
 
@@ -37,6 +41,8 @@ def main() -> int:
     """The command line; returns the exit code."""
     try:
         cfg = from_command_line()
+        if cfg.export is not None or cfg.movie is not None:
+            return write(cfg)
         # Only now: this imports torch and MuJoCo, and --help shall not wait for them.
         from goalgan_bt.viz.run import Run
         from goalgan_bt.viz.view import View
@@ -63,6 +69,30 @@ def main() -> int:
     return 0
 
 
+def write(cfg: ViewConfig) -> int:
+    """Write the files that were asked for; returns the exit code."""
+    try:
+        if cfg.export is not None:
+            from goalgan_bt.viz.export import export
+            from goalgan_bt.viz.run import Run
+
+            export(Run(cfg.runs[0]), cfg.export)
+            say(f"{cfg.export} ({cfg.export.stat().st_size / 1e6:.1f} MB)")
+        if cfg.movie is not None:
+            try:
+                from goalgan_bt.viz.movie import movie
+            except ImportError:
+                raise UsageError(
+                    'a movie needs the extra: pip install "goalgan_bt[plots]"'
+                ) from None
+            movie(cfg.runs[0], cfg.movie)
+            say(f"{cfg.movie} ({cfg.movie.stat().st_size / 1e6:.1f} MB)")
+    except OSError as error:
+        complain(f"cannot write: {error}")
+        return 2
+    return 0
+
+
 def from_command_line(argv: list[str] | None = None) -> ViewConfig:
     """What the command line asks for.
 
@@ -73,6 +103,8 @@ def from_command_line(argv: list[str] | None = None) -> ViewConfig:
     cfg = parse(ViewConfig, argv, "python -m goalgan_bt.viz")
     if not cfg.runs:
         raise UsageError("name at least one run folder: python -m goalgan_bt.viz RUN")
+    if len(cfg.runs) > 1 and (cfg.export is not None or cfg.movie is not None):
+        raise UsageError("--export and --movie show one run: name only one")
     if not 0 <= cfg.port <= 65535:
         raise UsageError(f"--port must be between 0 and 65535, not {cfg.port}")
     return cfg

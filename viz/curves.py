@@ -21,6 +21,7 @@ class Plot:
 
     title: str
     curves: tuple[tuple[str, str], ...]
+    share: bool = False  # whether all values lie between 0 and 1
 
 
 PLOTS = (
@@ -31,6 +32,7 @@ PLOTS = (
             ("eval/coverage_deterministic", "deterministic"),
             ("curriculum/estimated_coverage", "estimated"),
         ),
+        share=True,
     ),
     Plot(
         "Goals and success",
@@ -39,6 +41,7 @@ PLOTS = (
             ("curriculum/too_easy", "too easy"),
             ("rollout/success", "success"),
         ),
+        share=True,
     ),
     Plot("KL of a step, nats", (("trpo/kl", "TRPO"), ("imitation/kl", "imitation"))),
     Plot(
@@ -80,6 +83,14 @@ def series(run: Run, plot: Plot) -> tuple[FloatArray, ...]:
     return (steps[rows], *(joined(steps, run.column(name))[rows] for name, _ in plot.curves))
 
 
+def levels(run: Run, plot: Plot) -> list[tuple[str, float]]:
+    """The coverage that was published for a run's task, as lines of a plot: (name, coverage)."""
+    return [
+        (f"{line.method}, {line.last[0] / 1e6:.0f}M steps", line.last[1])
+        for line in (PUBLISHED.get(run.env, ()) if plot is PLOTS[0] else ())
+    ]
+
+
 class Curves:
     """The plots of one run, or one plot with the coverage of several.
 
@@ -95,13 +106,9 @@ class Curves:
             names = [run.name for run in runs]
             self._handles.append(_add(gui, "Coverage", self._compared(), names))
         else:
-            self._published = PUBLISHED.get(runs[0].env, ())
             for plot in PLOTS:
                 names = [name for _, name in plot.curves]
-                extra = [
-                    f"{line.method}, {line.last[0] / 1e6:.0f}M steps"
-                    for line in (self._published if plot is PLOTS[0] else ())
-                ]
+                extra = [name for name, _ in levels(runs[0], plot)]
                 self._handles.append(_add(gui, plot.title, self._data(plot), names, extra))
 
     def refresh(self) -> None:
@@ -114,9 +121,7 @@ class Curves:
 
     def _data(self, plot: Plot) -> tuple[FloatArray, ...]:
         data = series(self._runs[0], plot)
-        if plot is PLOTS[0]:
-            data += tuple(np.full(len(data[0]), line.last[1]) for line in self._published)
-        return data
+        return data + tuple(np.full(len(data[0]), y) for _, y in levels(self._runs[0], plot))
 
     def _compared(self) -> tuple[FloatArray, ...]:
         own = [series(run, PLOTS[0])[:2] for run in self._runs]

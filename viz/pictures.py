@@ -1,5 +1,6 @@
 """Pictures of run folders with matplotlib: coverage over steps, coverage over the maze."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,13 @@ COLOURS = "RdYlBu"
 LABELS = {-1: ("too hard", "#a50026"), 0: ("intermediate", "#111111"), 1: ("too easy", "#4575b4")}
 
 
-def coverage_curve(ax: Axes, folders: list[Path]) -> None:
+def coverage_curve(ax: Axes, folders: list[Path], until: int | None = None) -> None:
     """Measured coverage over training steps, a line per run, and the published figures.
+
+    Args:
+        ax: where to draw.
+        folders: the runs.
+        until: the last iteration to draw; the axes stay those of the whole run.
 
     Raises:
         RunError: if a folder is no run.
@@ -27,19 +33,17 @@ def coverage_curve(ax: Axes, folders: list[Path]) -> None:
     names: dict[str, None] = {}  # in the order given
     for i, folder in enumerate(folders):
         _, rows = record.read_metrics(folder)
-        points = [
-            (float(row["steps/train"]), float(row["eval/coverage"]))
-            for row in rows
-            if row.get("eval/coverage")
-        ]
-        steps, coverage = zip(*points, strict=True) if points else ((), ())
+        rows = [row for row in rows if row.get("eval/coverage")]
+        known = sum(until is None or int(row["iteration"]) <= until for row in rows)
+        steps = [float(row["steps/train"]) for row in rows]
+        coverage = [float(row["eval/coverage"]) for row in rows]
+        coverage[known:] = [math.nan] * (len(rows) - known)
         ax.plot(steps, coverage, color=f"C{i}", label=folder.name, marker=".", markersize=4)
         names[folder.name.split("-")[0]] = None
     for name in names:
         for line, grey in zip(PUBLISHED.get(name, ()), ("0.65", "0.35"), strict=False):
-            steps, coverage = zip(*line.points, strict=True)
             label = f"{line.method} (published)"
-            ax.plot(steps, coverage, "--", color=grey, marker="o", markersize=3, label=label)
+            ax.plot(*zip(*line.points, strict=True), "o--", color=grey, markersize=3, label=label)
             ax.set_xscale("log")
     ax.set(xlabel="environment steps of training", ylabel="coverage", ylim=(0, 1))
     ax.grid(alpha=0.25)

@@ -97,6 +97,14 @@ class Run:
             self._frames.popitem(last=False)
         return self._frames[iteration][1]
 
+    def box(self) -> FloatArray:
+        """The box of its goals, (2, goal_dim), metres."""
+        if self.maze is not None:
+            return np.stack([self.maze.low, self.maze.high])
+        frame = self.frame(self.iterations[0]) if self.iterations else None
+        goals = np.zeros((1, 2)) if frame is None else frame["goals"]
+        return np.stack([np.minimum(goals.min(axis=0), -5), np.maximum(goals.max(axis=0), 5)])
+
     def ended(self) -> str | None:
         """How the run ended, or None while it goes on (or was killed without a word)."""
         try:

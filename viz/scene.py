@@ -3,6 +3,8 @@
 Each layer is one node that is replaced in place; a frame of a run fills them all.
 """
 
+import contextlib
+import io
 from collections.abc import Sequence
 
 import numpy as np
@@ -23,8 +25,10 @@ TOO_HARD, INTERMEDIATE, TOO_EASY, REPLAYED = (
     (31, 119, 180),
     (120, 120, 120),
 )
-TRACE, PATH, MARK = (255, 140, 0), (90, 90, 100), (255, 0, 170)
+TRACE, OLD_TRACE = (255, 150, 0), (25, 12, 12)  # at the goal, and farthest back
+PATH, MARK = (90, 90, 100), (255, 0, 170)
 WALL, FLOOR, START = (105, 110, 120), (45, 48, 54), (255, 255, 255)
+FAR_BELOW = np.full((1, 1, 3), -100, dtype=np.float32)  # where a layer with nothing in it is
 PIXELS = 16  # per tile of the coverage map
 WALL_HEIGHT = 0.35  # metres: low, so that no wall hides the map
 
@@ -129,6 +133,9 @@ class Scene:
     ) -> None:
         self._scene, self._maze, self._prefix = server.scene, maze, prefix
         self._low, self._high = np.asarray(box)[:, :2]
+        # Only a strip of the outer wall is drawn: the map is what one wants to see.
+        hidden = 0.0 if maze is None else 0.75 * maze.cell_size
+        self._first, self._last = self._low + hidden, self._high - hidden
         self._scene.add_frame(prefix, show_axes=False, position=(*offset, 0.0))
         self._groups = {
             name: self._scene.add_frame(f"{prefix}/{name}", show_axes=False, visible=shown)
@@ -138,13 +145,13 @@ class Scene:
 
     @property
     def size(self) -> float:
-        """The longer side of the box, metres."""
-        return float((self._high - self._low).max())
+        """The longer side of what is drawn, metres."""
+        return float((self._last - self._first).max())
 
     @property
     def centre(self) -> FloatArray:
-        """The middle of the box, (2,), metres."""
-        return np.asarray((self._low + self._high) / 2)
+        """The middle of what is drawn, (2,), metres."""
+        return np.asarray((self._first + self._last) / 2)
 
     def show(self, layer: str, visible: bool) -> None:
         """Show or hide a layer."""
@@ -163,10 +170,9 @@ class Scene:
         self._points("replay", frame.get("replay", none), REPLAYED, 0.012, 0.03)
         empty = np.empty((0, 0, 2))
         points, step = segments(frame.get("traces", empty))
-        fade = np.clip(1 - step / max(1, len(frame.get("traces", empty)) - 1), 0.1, 1)[:, None]
-        floor = np.array([235, 235, 235])
-        shade = (floor + (np.array(TRACE) - floor) * fade).astype(np.uint8)
-        self._lines("traces", points, np.repeat(shade[:, None], 2, axis=1), 2.0)
+        fade = (1 - step / max(1, len(frame.get("traces", empty)) - 2))[:, None]
+        shade = (OLD_TRACE + np.subtract(TRACE, OLD_TRACE) * fade).astype(np.uint8)
+        self._lines("traces", points, np.repeat(shade[:, None], 2, axis=1), 2.5)
         points, _ = segments(frame.get("paths", empty))
         self._lines("paths", points, PATH, 1.0)
 
@@ -182,7 +188,7 @@ class Scene:
         return f"{self._prefix}/{layer}/{node}"
 
     def _draw_maze(self) -> None:
-        width, height = self._high - self._low + 0.08 * self.size
+        width, height = self._last - self._first + 0.08 * self.size
         self._scene.add_box(
             f"{self._prefix}/floor",
             color=FLOOR,
@@ -192,7 +198,9 @@ class Scene:
             receive_shadow=False,
         )
         boxes: Sequence[FloatArray] = [] if self._maze is None else list(self._maze.walls())
-        for i, (x0, y0, x1, y1) in enumerate(boxes):
+        for i, box in enumerate(boxes):
+            x0, y0 = np.maximum(box[:2], self._first)
+            x1, y1 = np.minimum(box[2:], self._last)
             self._scene.add_box(
                 self._name("walls", str(i)),
                 color=WALL,
@@ -218,7 +226,7 @@ class Scene:
             format="png",
             cast_shadow=False,
             receive_shadow=False,
-            position=(*self.centre, 0.005),
+            position=(*(self._low + self._high) / 2, 0.005),
             wxyz=(0.0, 1.0, 0.0, 0.0),  # viser's images look down; seen from above, y is up
         )
 
@@ -228,10 +236,11 @@ class Scene:
         palette = np.array([TOO_HARD, INTERMEDIATE, TOO_EASY], dtype=np.uint8)
         shade = palette[np.clip(label, -1, 1).astype(int) + 1]
         old = np.asarray(frame.get("replayed", np.zeros(len(goals))), dtype=bool)
-        for node, rows, size in (("new", ~old, 0.11), ("old", old, 0.06)):
+        for node, rows, size in (("new", ~old, 0.09), ("old", old, 0.05)):
             # A dark rim, so that white goals are seen on a pale floor.
-            self._points("goals", goals[rows], (20, 20, 20), size * 1.35, 0.035, node + "_rim")
-            self._points("goals", goals[rows], shade[rows], size, 0.045, node)
+            # They float: a disc that faces the camera would stick in the floor.
+            self._points("goals", goals[rows], (20, 20, 20), size * 1.3, 0.1, node + "_rim")
+            self._points("goals", goals[rows], shade[rows], size, 0.11, node)
 
     def _points(
         self,
@@ -242,9 +251,12 @@ class Scene:
         height: float,
         node: str = "node",
     ) -> None:
+        places = on_floor(points, height)
+        if not len(places):  # the page wants as many colours as points, and one of each
+            places, colour = FAR_BELOW[0], np.zeros((1, 3), dtype=np.uint8)
         self._scene.add_point_cloud(
             self._name(layer, node),
-            on_floor(points, height),
+            places,
             colour,
             point_size=size,
             point_shape="circle",
@@ -260,9 +272,29 @@ class Scene:
         width: float,
         node: str = "node",
     ) -> None:
+        if not len(points):
+            points, colour = FAR_BELOW.repeat(2, axis=1), np.zeros((1, 2, 3), dtype=np.uint8)
         self._scene.add_line_segments(
-            self._name(layer, node), points, colour, thickness=width, thickness_units="screen"
+            self._name(layer, node),
+            points,
+            colour,
+            thickness=width,
+            thickness_units="screen",
         )
+
+
+def start_server(host: str, port: int) -> viser.ViserServer:
+    """A viser server, without its banner; a busy port is replaced by a free one."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        return viser.ViserServer(host=host, port=port, label="goalgan_bt")
+
+
+def look_at(server: viser.ViserServer, centre: FloatArray, size: float) -> None:
+    """Put the camera where a square of the floor is seen: its middle, (2,), and side, metres."""
+    camera = server.initial_camera
+    camera.position = (centre[0], centre[1] - 0.5 * size, 0.92 * size)
+    camera.look_at = (centre[0], centre[1], 0.0)
+    camera.up = (0.0, 0.0, 1.0)
 
 
 def legend() -> str:

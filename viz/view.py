@@ -5,7 +5,6 @@ browser only puts a request into a queue; nothing that comes from there becomes 
 """
 
 import contextlib
-import io
 import queue
 import time
 from functools import partial
@@ -20,13 +19,13 @@ from goalgan_bt.viz.body import Bodies
 from goalgan_bt.viz.curves import Curves
 from goalgan_bt.viz.player import Attempt, Player
 from goalgan_bt.viz.run import Frame, Run, number, success
-from goalgan_bt.viz.scene import LAYERS, Scene, legend
+from goalgan_bt.viz.scene import LAYERS, Scene, legend, look_at, start_server
+from goalgan_bt.viz.words import caption, settings_table, state
 
 LOOK_EVERY = 1.0  # seconds between two looks at the run folders
 TICK = 1 / 25  # seconds between two pictures of the body
 PAUSE = 1.0  # seconds for which a finished attempt stands still
 GAP = 1.15  # distance of two mazes side by side, in sides of one
-SILENT = 120.0  # seconds without news after which a run counts as stopped
 
 
 class View:
@@ -39,10 +38,9 @@ class View:
 
     def __init__(self, runs: list[Run], host: str = "127.0.0.1", port: int = 8080) -> None:
         self.runs = runs
-        with contextlib.redirect_stdout(io.StringIO()):  # viser's banner
-            self.server = viser.ViserServer(host=host, port=port, label="goalgan_bt")
+        self.server = start_server(host, port)
         self._requests: queue.Queue[tuple[str, Any]] = queue.Queue(maxsize=100)
-        boxes = [box_of(run) for run in runs]
+        boxes = [run.box() for run in runs]
         # Metres from one maze to the next, the same for all: GAP sides of the largest.
         self._spread = GAP * max(float(np.ptp(box[:, :2], axis=0).max()) for box in boxes)
         self._scenes = [
@@ -131,7 +129,7 @@ class View:
                     scene.draw(frame)
                 self._drawn[i] = frame
         self._shown = index
-        self._caption.content = self._describe_report(index)
+        self._caption.content = caption(run, run.iterations[index])
 
     def _play_time(self, now: float) -> None:
         if not self._play.value:
@@ -226,11 +224,8 @@ class View:
         size = first.size + row
         middle = (first.centre + last.centre) / 2
         middle[0] += row / 2
-        camera = self.server.initial_camera
-        right = 0.1 * size  # the panel covers the right of the page
-        camera.position = (middle[0] + right, middle[1] - 0.5 * size, 0.92 * size)
-        camera.look_at = (middle[0] + right, middle[1], 0.0)
-        camera.up = (0.0, 0.0, 1.0)
+        middle[0] += 0.1 * size  # the panel covers the right of the page
+        look_at(self.server, middle, size)
 
     def _build_panel(self) -> None:
         gui = self.server.gui
@@ -294,19 +289,6 @@ class View:
     def _describe(self) -> str:
         return "\n\n".join(f"**{run.name}** {state(run)}" for run in self.runs)
 
-    def _describe_report(self, index: int) -> str:
-        run = self.runs[0]
-        iteration = run.iterations[index]
-        frame, row = run.frame(iteration), run.row_of(iteration)
-        words = [f"Iteration {iteration:,}"]
-        if row:
-            words.append(f"{number(row.get('steps/train')):,.0f} steps")
-        if frame is not None:
-            rate, measured = success(frame)
-            kind = "coverage (measured)" if measured else "coverage (estimated)"
-            words.append(f"{kind} **{np.mean(rate) if len(rate) else np.nan:.2f}**")
-        return " · ".join(words)
-
     def _describe_attempt(self, now: float) -> str:
         attempt = self._attempt
         assert attempt is not None and self._player is not None
@@ -324,40 +306,11 @@ class View:
         return f"{whose}All tiles: **{reached} of {len(ended)}** reached, {ended.sum()} ended"
 
 
-def box_of(run: Run) -> FloatArray:
-    """The box of a run's goals, (2, goal_dim), metres."""
-    if run.maze is not None:
-        return np.stack([run.maze.low, run.maze.high])
-    frame = run.frame(run.iterations[0]) if run.iterations else None
-    goals = np.zeros((1, 2)) if frame is None else frame["goals"]
-    return np.stack([np.minimum(goals.min(axis=0), -5), np.maximum(goals.max(axis=0), 5)])
-
-
 def report_at(run: Run, steps: float) -> int:
     """The iteration of the last report that a run had made after so many steps."""
     known = dict(zip(run.column("iteration"), run.column("steps/train"), strict=True))
     before = [i for i in run.iterations if known.get(i, 0) <= steps]
     return before[-1] if before else (run.iterations[0] if run.iterations else 0)
-
-
-def state(run: Run) -> str:
-    """What goes on in a run, in a few words."""
-    if run.gone:
-        return "is gone: the folder has vanished; this is the last that was seen of it."
-    if not run.rows:
-        return "has begun; no iteration is finished yet."
-    row = run.rows[-1]
-    measured = run.column("eval/coverage")
-    measured = measured[np.isfinite(measured)]
-    coverage = f", coverage {measured[-1]:.2f}" if len(measured) else ""
-    progress = (
-        f"iteration {number(row.get('iteration')):,.0f}, "
-        f"{number(row.get('steps/train')) / 1e6:.2f}M steps, "
-        f"{number(row.get('time/fps')):,.0f} steps/s{coverage}"
-    )
-    if (ended := run.ended()) is not None:
-        return f"ended ({ended}): {progress}"
-    return f"{'learns' if run.age() < SILENT else 'is silent'}: {progress}"
 
 
 def as_csv(frame: Frame) -> bytes:
@@ -368,22 +321,6 @@ def as_csv(frame: Frame) -> bytes:
     for goal, value in zip(frame["test_goals"], rate, strict=True):
         lines.append(",".join([*(f"{x:.4f}" for x in goal), f"{value:.4f}", str(int(measured))]))
     return ("\n".join(lines) + "\n").encode()
-
-
-def settings_table(settings: dict[str, Any]) -> str:
-    """The settings as a markdown table."""
-
-    def rows(values: dict[str, Any], prefix: str) -> list[str]:
-        out = []
-        for name, value in values.items():
-            if isinstance(value, dict):
-                out += rows(value, f"{prefix}{name}.")
-            else:
-                text = str(value).replace("|", "/").replace("<", "&lt;").replace("`", "'")
-                out.append(f"| {prefix}{name} | {text} |")
-        return out
-
-    return "\n".join(["| setting | value |", "|---|---|", *rows(settings, "")])
 
 
 def about() -> str:

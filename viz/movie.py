@@ -1,0 +1,61 @@
+"""The map of a run as it grows, as a GIF or MP4: `python -m goalgan_bt.viz RUN --movie out.gif`."""
+
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from rich.progress import track
+
+from goalgan_bt import record
+from goalgan_bt.viz import pictures
+
+PICTURES = 100  # of the run, evenly spread over its reports
+PER_SECOND = 10
+HOLD = 25  # times that the last picture is shown
+
+
+def movie(folder: Path, path: Path) -> None:
+    """Draw the map beside the curve, report by report.
+
+    Args:
+        folder: the run; it must have a maze.
+        path: a .gif or .mp4 file; MP4 needs the extra `movie`.
+
+    Raises:
+        RunError: if the run has no maze or no report, or the file is of another kind.
+        OSError: if the file cannot be written.
+    """
+    if path.suffix not in (".gif", ".mp4"):
+        raise record.RunError(f"--movie makes a .gif or a .mp4 file, not {path.name}")
+    frames = record.frames(folder)
+    if not frames:
+        raise record.RunError(f"{folder} holds no report yet: wait for its first one")
+    picks = np.unique(np.linspace(0, len(frames) - 1, PICTURES).round().astype(int))
+    images = [_picture(folder, frames[i]) for i in track(picks, "movie", transient=True)]
+    images += [images[-1]] * HOLD
+    if path.suffix == ".gif":
+        data = iio.imwrite("<bytes>", images, extension=".gif", duration=1000 / PER_SECOND, loop=0)
+    else:
+        try:
+            data = iio.imwrite(
+                "<bytes>", images, extension=".mp4", plugin="pyav", codec="libx264", fps=PER_SECOND
+            )
+        except ImportError:
+            raise record.RunError('an MP4 needs PyAV: pip install "goalgan_bt[movie]"') from None
+    record.write_atomically(path, lambda file: file.write(data))
+
+
+def _picture(folder: Path, frame: Path) -> NDArray[np.uint8]:
+    """One report, (height, width, 3)."""
+    figure = Figure(figsize=(9.6, 4.2), dpi=80, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2, width_ratios=[1, 1.2])
+    image = pictures.coverage_map(left, folder, frame)
+    left.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=3, frameon=False)
+    figure.colorbar(image, ax=left, label="success", shrink=0.8)
+    pictures.coverage_curve(right, [folder], until=int(frame.stem))
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
