@@ -114,8 +114,8 @@ POINT = Config(
     action_repeat=4,
     discount=0.97,
     updates=8,
-    policy=PolicyConfig(init_std=1.0, final_std=0.3),
-    value=ValueConfig(minibatch=128),
+    policy=PolicyConfig(input_gain=3.0, init_std=1.0, final_std=0.3),
+    value=ValueConfig(input_gain=3.0, minibatch=128),
     rollout=RolloutConfig(num_envs=32, steps=40),
     goals=GoalsConfig(old=40),
     trpo=TrpoConfig(max_kl=0.01),
@@ -148,15 +148,15 @@ def check(cfg: Config) -> None:
     preset(cfg.env)  # is there such an environment?
     above_zero = (
         "iterations total_steps minutes horizon action_repeat learning_threads updates "
-        "report_every "
-        "rollout.num_envs rollout.steps goals.new goals.near goals.episodes goals.neighbours "
-        "policy.init_std policy.final_std policy.min_std policy.hidden value.hidden "
-        "value.learning_rate value.epochs value.minibatch gan.learning_rate gan.batch gan.steps "
-        "gan.noise_dim gan.pretrain_steps gan.generator_hidden gan.discriminator_hidden "
-        "trpo.max_kl trpo.cg_iters trpo.fisher_fraction trpo.line_search_decay "
-        "backtracking.batch backtracking.buffer backtracking.learning_rate backtracking.hidden "
-        "backtracking.min_transitions backtracking.max_shift imitation.batch "
-        "imitation.learning_rate imitation.max_kl coverage.rollouts coverage.every"
+        "report_every rollout.num_envs rollout.steps goals.new goals.near goals.episodes "
+        "goals.neighbours policy.init_std policy.final_std policy.min_std policy.hidden "
+        "policy.input_gain value.hidden value.input_gain value.learning_rate value.epochs "
+        "value.minibatch gan.learning_rate gan.batch gan.steps gan.noise_dim gan.pretrain_steps "
+        "gan.generator_hidden gan.discriminator_hidden trpo.max_kl trpo.cg_iters "
+        "trpo.fisher_fraction trpo.line_search_decay backtracking.batch backtracking.buffer "
+        "backtracking.learning_rate backtracking.hidden backtracking.min_transitions "
+        "backtracking.max_shift imitation.batch imitation.learning_rate imitation.max_kl "
+        "coverage.rollouts coverage.every"
     )
     not_negative = (
         "seed threads goals.old goals.labelled goals.replay_distance goals.label_rollouts "

@@ -20,6 +20,8 @@ class PolicyConfig:
 
     hidden: tuple[int, ...] = (128, 128)
     """Units of the hidden layers (the original: 64 64)."""
+    input_gain: float = 1.0
+    """Scale of the first layer's first weights: more lets neighbouring places differ more."""
     init_std: float = 0.6
     """First standard deviation of the actions, in units of the action range [-1, 1]."""
     min_std: float = 0.05
@@ -35,6 +37,8 @@ class ValueConfig:
 
     hidden: tuple[int, ...] = (128, 128)
     """Units of the hidden layers."""
+    input_gain: float = 1.0
+    """As the policy's."""
     learning_rate: float = 1e-3
     """Step size of Adam."""
     epochs: int = 2
@@ -43,19 +47,25 @@ class ValueConfig:
     """Observations per gradient step."""
 
 
-def mlp(sizes: tuple[int, ...], activation: type[nn.Module], output_gain: float = 1.0) -> nn.Module:
+def mlp(
+    sizes: tuple[int, ...],
+    activation: type[nn.Module],
+    output_gain: float = 1.0,
+    input_gain: float = 1.0,
+) -> nn.Module:
     """A fully connected network with orthogonal weights and zero biases.
 
     Args:
         sizes: units of every layer, the input first.
         activation: between the layers, not after the last.
-        output_gain: scale of the last layer's weights.
+        output_gain, input_gain: scale of the last and of the first layer's weights.
     """
     layers: list[nn.Module] = []
     for i, (fan_in, fan_out) in enumerate(pairwise(sizes)):
         last = i == len(sizes) - 2
         linear = nn.Linear(fan_in, fan_out)
-        nn.init.orthogonal_(linear.weight, output_gain if last else math.sqrt(2))
+        gain = output_gain if last else math.sqrt(2)
+        nn.init.orthogonal_(linear.weight, gain * (input_gain if i == 0 else 1.0))
         nn.init.zeros_(linear.bias)
         layers += [linear] if last else [linear, activation()]
     return nn.Sequential(*layers)
@@ -97,9 +107,9 @@ class MeanNetwork(nn.Module):
     the Ant learn faster (docs/LOG.md). It starts at zero.
     """
 
-    def __init__(self, sizes: tuple[int, ...]) -> None:
+    def __init__(self, sizes: tuple[int, ...], input_gain: float = 1.0) -> None:
         super().__init__()
-        self.mlp = mlp(sizes, nn.Tanh, output_gain=0.01)
+        self.mlp = mlp(sizes, nn.Tanh, output_gain=0.01, input_gain=input_gain)
         self.linear = nn.Linear(sizes[0], sizes[-1], bias=False)
         nn.init.zeros_(self.linear.weight)
 
@@ -116,7 +126,7 @@ class GaussianPolicy(nn.Module):
     def __init__(self, obs_dim: int, act_dim: int, cfg: PolicyConfig) -> None:
         super().__init__()
         self.normaliser = Normaliser(obs_dim)
-        self.net = MeanNetwork((obs_dim, *cfg.hidden, act_dim))
+        self.net = MeanNetwork((obs_dim, *cfg.hidden, act_dim), cfg.input_gain)
         self.log_std = nn.Parameter(torch.full((act_dim,), math.log(cfg.init_std)))
         self.cfg = cfg
         # A buffer: whoever loads the policy acts with the noise that it had.
@@ -169,7 +179,7 @@ class ValueFunction(nn.Module):
     def __init__(self, obs_dim: int, cfg: ValueConfig) -> None:
         super().__init__()
         self.cfg = cfg
-        self.net = mlp((obs_dim, *cfg.hidden, 1), nn.Tanh)
+        self.net = mlp((obs_dim, *cfg.hidden, 1), nn.Tanh, input_gain=cfg.input_gain)
         self.optimiser = torch.optim.Adam(self.net.parameters(), lr=cfg.learning_rate, fused=True)
 
     def forward(self, normalised: Tensor) -> Tensor:

@@ -9,16 +9,18 @@ import pytest
 import torch
 import viser
 import websockets.sync.client
+import zstandard
 from conftest import run_module, serve
 from viser import _messages
 
 from goalgan_bt import record
 from goalgan_bt.envs import maze as mazes
 from goalgan_bt.viz.curves import joined, thinned
+from goalgan_bt.viz.download import as_csv
 from goalgan_bt.viz.player import Player
 from goalgan_bt.viz.run import Run, success
 from goalgan_bt.viz.scene import colours, segments, tile_image
-from goalgan_bt.viz.view import View, as_csv, report_at
+from goalgan_bt.viz.view import View, report_at
 
 
 @pytest.fixture
@@ -255,23 +257,61 @@ def test_csv_has_a_line_per_tile(folder):
     assert all(line.endswith(",1") for line in lines[1:])
 
 
+def connected(view, origin=None):
+    """A websocket to a page's server, as a browser opens it."""
+    return websockets.sync.client.connect(
+        f"ws://127.0.0.1:{view.server.get_port()}",
+        subprotocols=[f"viser-v{viser.__version__}"],
+        origin=origin,
+        max_size=None,
+    )
+
+
+def send(socket, message):
+    socket.send(msgspec.msgpack.encode(message.as_serializable_dict()))
+
+
+def unpacked(data):
+    """The messages in a packet of viser's, still msgpack: two lengths, then zstd."""
+    length = int.from_bytes(data[8:16], "little")
+    return zstandard.ZstdDecompressor().decompress(data[16 : 16 + length])
+
+
+def wait(seconds, condition, step):
+    """Do a step over and over until there is what one waits for."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        step()
+        time.sleep(0.02)
+
+
+def test_the_run_is_sent_as_one_page(view, folder):
+    with connected(view) as socket:
+        camera = (1.0, 0, 0, 0), (0.0, 0, 5), 1.0, 0.1, 100.0, 600, 800, (0.0, 0, 0), (0.0, 1, 0)
+        send(socket, _messages.ViewerCameraMessage(*camera))  # who looks is a client
+        wait(10, view.server.get_clients, lambda: None)
+        (client,) = view.server.get_clients().values()
+        view._ask("page", client)
+        view.tick(time.monotonic())
+        assert view._export is not None
+        wait(60, lambda: view._export is None, lambda: view.tick(time.monotonic()))
+        received = b""
+        while b"FileTransferStartDownload" not in received:
+            received = unpacked(socket.recv(timeout=20))
+    assert f"{folder.name}.html".encode() in received
+
+
 def test_a_foreign_page_changes_no_file_and_ends_nothing(view, folder):
     """A page of another origin sends nonsense to every control there is."""
     before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
     controls = list(view.server.gui._gui_input_handle_from_uuid)
     assert len(controls) >= 13
-    address = f"ws://127.0.0.1:{view.server.get_port()}"
     nonsense = ("../../etc/passwd", "__import__('os').remove('x')", -(10**9), None, [1], {"a": 1})
-    with websockets.sync.client.connect(
-        address,
-        subprotocols=[f"viser-v{viser.__version__}"],
-        origin="https://evil.example",
-        max_size=None,
-    ) as socket:
+    with connected(view, origin="https://evil.example") as socket:
         for uuid in controls:
             for value in nonsense:
-                message = _messages.GuiUpdateMessage(uuid, {"value": value})
-                socket.send(msgspec.msgpack.encode(message.as_serializable_dict()))
+                send(socket, _messages.GuiUpdateMessage(uuid, {"value": value}))
         time.sleep(0.5)
         for _ in range(50):
             view.tick(time.monotonic())

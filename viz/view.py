@@ -17,8 +17,9 @@ from goalgan_bt.config import ConfigError
 from goalgan_bt.envs.maze import FloatArray
 from goalgan_bt.viz.body import Bodies
 from goalgan_bt.viz.curves import Curves
+from goalgan_bt.viz.download import Export, as_csv
 from goalgan_bt.viz.player import Attempt, Player
-from goalgan_bt.viz.run import Frame, Run, number, success
+from goalgan_bt.viz.run import Frame, Run, number
 from goalgan_bt.viz.scene import LAYERS, Scene, legend, look_at, start_server
 from goalgan_bt.viz.words import caption, settings_table, state
 
@@ -56,6 +57,7 @@ class View:
         self._attempt_began = 0.0
         self._asked = False  # whether the attempt is one that somebody asked for
         self._last_look = 0.0
+        self._export: Export | None = None  # one at a time, whoever asks
         self._place_camera()
         self._build_panel()
         self.server.scene.on_click()(self._clicked)
@@ -88,6 +90,8 @@ class View:
         if now - self._last_look >= LOOK_EVERY:
             self._look()
             self._last_look = now
+        if self._export is not None and self._export.done():
+            self._export = None
         self._play_time(now)
         if self.server.get_clients():  # otherwise nobody looks
             self._play_body(now)
@@ -180,8 +184,10 @@ class View:
     def _serve(self, request: str, value: Any) -> None:
         if request == "slider":
             self._show(int(value))
-        elif request == "download":
-            self._download(value)
+        elif request == "csv" and value is not None:
+            self._send_csv(value)
+        elif request == "page" and value is not None and self._export is None:
+            self._export = Export(self.runs[0].folder, value)
         elif request == "layer":
             for scene in self._scenes:
                 scene.show(value[0], bool(value[1]))
@@ -261,8 +267,10 @@ class View:
             self._curves = Curves(gui, self.runs)
         with tabs.add_tab("About"):
             gui.add_markdown(about())
-            download = gui.add_button("This report as CSV")
-            download.on_click(lambda event: self._ask("download", event.client))
+            table = gui.add_button("This report as CSV")
+            table.on_click(lambda event: self._ask("csv", event.client))
+            page = gui.add_button("This run as one HTML page")
+            page.on_click(lambda event: self._ask("page", event.client))
             gui.add_markdown("### Settings\n\n" + settings_table(self.runs[0].settings))
 
     def _layer_switched(self, name: str, event: Any) -> None:
@@ -276,9 +284,9 @@ class View:
     def _stop_following(self) -> None:
         self._follow.value = False
 
-    def _download(self, client: viser.ClientHandle | None) -> None:
+    def _send_csv(self, client: viser.ClientHandle) -> None:
         run = self.runs[0]
-        if client is None or self._shown is None or self._shown >= len(run.iterations):
+        if self._shown is None or self._shown >= len(run.iterations):
             return
         frame = run.frame(run.iterations[self._shown])
         if frame is not None:
@@ -311,16 +319,6 @@ def report_at(run: Run, steps: float) -> int:
     known = dict(zip(run.column("iteration"), run.column("steps/train"), strict=True))
     before = [i for i in run.iterations if known.get(i, 0) <= steps]
     return before[-1] if before else (run.iterations[0] if run.iterations else 0)
-
-
-def as_csv(frame: Frame) -> bytes:
-    """Test goals and their success as a table."""
-    rate, measured = success(frame)
-    names = [f"goal_{i}" for i in range(frame["test_goals"].shape[1])]
-    lines = [",".join([*names, "success", "measured"])]
-    for goal, value in zip(frame["test_goals"], rate, strict=True):
-        lines.append(",".join([*(f"{x:.4f}" for x in goal), f"{value:.4f}", str(int(measured))]))
-    return ("\n".join(lines) + "\n").encode()
 
 
 def about() -> str:
