@@ -34,7 +34,7 @@ def test_a_page_holds_the_whole_run(folder, tmp_path):
     times = [r["time"] for r in run["reports"]]
     assert times == sorted(times) and times[0] == 0
     measured = run["plots"][0]["curves"][0]["y"]
-    assert measured[-1] == pytest.approx(Run(folder).column("eval/coverage")[-1], abs=1e-3)
+    assert measured[-1] == pytest.approx(Run(folder).metrics.column("eval/coverage")[-1], abs=1e-3)
     assert [level["y"] for level in run["plots"][0]["levels"]] == [0.78, 0.96]
     assert ["env", "point_umaze"] in run["settings"]
     assert "__VISER_EMBED_DATA__" in run["scene"]

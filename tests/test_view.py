@@ -17,6 +17,7 @@ from goalgan_bt import record
 from goalgan_bt.envs import maze as mazes
 from goalgan_bt.viz.curves import joined, thinned
 from goalgan_bt.viz.download import as_csv
+from goalgan_bt.viz.metrics import Metrics
 from goalgan_bt.viz.player import Player
 from goalgan_bt.viz.run import Run, success
 from goalgan_bt.viz.scene import colours, segments, tile_image
@@ -39,12 +40,12 @@ def node(view, name):
 
 def test_a_run_is_read_whole(folder):
     run = Run(folder)
-    assert run.iterations == [1, 2, 3, 4] and len(run.rows) == 4
+    assert run.iterations == [1, 2, 3, 4] and len(run.metrics) == 4
     assert run.env == "point_umaze" and run.maze.free.sum() == 7
     assert run.ended() == "complete" and not run.gone
     rate, measured = success(run.frame(4))
     assert rate.shape == (112,) and measured
-    assert np.isclose(rate.mean(), run.column("eval/coverage")[-1], atol=1e-5)
+    assert np.isclose(rate.mean(), run.metrics.column("eval/coverage")[-1], atol=1e-5)
 
 
 def test_news_is_seen_and_only_news(folder):
@@ -54,8 +55,27 @@ def test_news_is_seen_and_only_news(folder):
     assert run.refresh() and run.iterations[-1] == 9
     with (folder / "metrics.csv").open("a") as file:
         file.write("5,")  # a line that is being written
-    assert run.refresh() and len(run.rows) == 4
+    assert run.refresh() and len(run.metrics) == 4
     assert not run.refresh()
+
+
+def test_metrics_are_read_as_they_grow_break_off_and_are_replaced(tmp_path):
+    path = tmp_path / "metrics.csv"
+    metrics = Metrics(path)
+    assert not metrics.refresh() and len(metrics) == 0 and np.isnan(metrics.last("a"))
+    path.write_text("iteration,a\n1,0.5\n2,")
+    assert metrics.refresh() and len(metrics) == 1
+    with path.open("a") as file:
+        file.write("\n3,7,7\nx,1\n4,2\n")
+    assert metrics.refresh() and len(metrics) == 3  # neither the row too long nor the one without
+    assert np.array_equal(metrics.column("a"), [0.5, np.nan, 2.0], equal_nan=True)
+    assert metrics.at(4, "a") == 2 and np.isnan(metrics.at(3, "a")) and metrics.last("a") == 2
+    (tmp_path / "new").write_text("iteration,b\n1,9\n")
+    (tmp_path / "new").replace(path)
+    assert metrics.refresh() and metrics.column("b").tolist() == [9.0]
+    assert np.isnan(metrics.column("a")).all()
+    path.unlink()
+    assert not metrics.refresh() and len(metrics) == 1
 
 
 def test_a_frame_that_is_written_anew_is_read_anew(folder):
@@ -82,7 +102,7 @@ def test_a_folder_that_vanishes_leaves_what_was_seen(folder):
     frame = run.frame(4)
     shutil.rmtree(folder)
     assert not run.refresh() and run.gone
-    assert run.frame(4) is frame and run.frame(1) is None and len(run.rows) == 4
+    assert run.frame(4) is frame and run.frame(1) is None and len(run.metrics) == 4
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path):
@@ -248,7 +268,7 @@ def test_the_body_acts_with_the_noise_that_was_recorded(folder):
     assert player.take_newest()
     policy = player._policy
     std = float(policy(torch.zeros(1, player.env.obs_dim))[1].exp().mean())
-    assert np.isclose(std, Run(folder).column("rollout/std")[-1], rtol=1e-4)
+    assert np.isclose(std, Run(folder).metrics.column("rollout/std")[-1], rtol=1e-4)
 
 
 def test_csv_has_a_line_per_tile(folder):

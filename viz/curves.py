@@ -76,11 +76,12 @@ def joined(x: FloatArray, y: FloatArray) -> FloatArray:
 
 def series(run: Run, plot: Plot) -> tuple[FloatArray, ...]:
     """Million steps and every curve of a plot, each (n,)."""
-    if not run.rows:
+    if not len(run.metrics):
         return tuple(np.zeros((1 + len(plot.curves), 1)))
-    steps = run.column("steps/train") / 1e6
+    column = run.metrics.column
+    steps = column("steps/train") / 1e6
     rows = thinned(len(steps))
-    return (steps[rows], *(joined(steps, run.column(name))[rows] for name, _ in plot.curves))
+    return (steps[rows], *(joined(steps, column(name))[rows] for name, _ in plot.curves))
 
 
 def levels(run: Run, plot: Plot) -> list[tuple[str, float]]:

@@ -19,7 +19,7 @@ from goalgan_bt.record import RunError, write_atomically
 from goalgan_bt.viz.body import Bodies
 from goalgan_bt.viz.curves import COLOURS, PLOTS, levels, series
 from goalgan_bt.viz.player import Player
-from goalgan_bt.viz.run import Frame, Run, number
+from goalgan_bt.viz.run import Frame, Run
 from goalgan_bt.viz.scene import LAYERS, Scene, legend, look_at, start_server
 from goalgan_bt.viz.words import caption, settings_rows, state
 
@@ -45,7 +45,7 @@ def export(run: Run, path: Path) -> None:
     server = start_server("127.0.0.1", 0)
     try:
         scene = Scene(server, run.maze, run.box())
-        look_at(server, scene.centre, scene.size)
+        look_at(server.initial_camera, scene.centre, scene.size)
         picks = np.linspace(0, len(run.iterations) - 1, min(len(run.iterations), MOST_REPORTS))
         pause = float(np.clip(LENGTH / len(picks), 0.1, 1.0))
         recording = server.get_scene_serializer()
@@ -55,7 +55,7 @@ def export(run: Run, path: Path) -> None:
             if frame is None:
                 continue
             scene.draw(_smaller(frame))
-            steps = number(run.row_of(run.iterations[i]).get("steps/train")) / 1e6
+            steps = run.metrics.at(run.iterations[i], "steps/train") / 1e6
             text = caption(run, run.iterations[i]).replace("**", "")
             reports.append({"time": time, "steps": _known(steps) or 0.0, "text": text})
             recording.insert_sleep(pause)

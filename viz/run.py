@@ -3,8 +3,8 @@
 A run may be live (files grow and appear while they are read), finished, of another version, gone.
 """
 
+import contextlib
 import json
-import math
 import time
 from collections import OrderedDict
 from pathlib import Path
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from goalgan_bt import record
 from goalgan_bt.envs.maze import FloatArray, MapError, Maze
+from goalgan_bt.viz.metrics import Metrics
 
 Frame = dict[str, NDArray[Any]]
 REMEMBERED = 64  # frames kept in memory
@@ -43,7 +44,7 @@ class Run:
         name, env, maze: from the folder; maze is None where there are no walls.
         settings: the resolved settings as nested dictionaries.
         iterations: of the frames there are, ascending.
-        rows: of `metrics.csv`, as text.
+        metrics: what `metrics.csv` holds.
         gone: whether the folder has vanished; what was read of it stays.
 
     Raises:
@@ -59,9 +60,9 @@ class Run:
         except (OSError, ValueError, KeyError, TypeError):
             raise record.RunError(f"{folder} is no run: it has no readable config.json") from None
         self.iterations: list[int] = []
-        self.rows: list[dict[str, str]] = []
+        self.metrics = Metrics(folder / "metrics.csv")
         self.gone = False
-        self._stamp: tuple[int, int] | None = None
+        self._listed = -1  # when the frames had last changed before they were listed
         self._frames: OrderedDict[int, tuple[int, Frame]] = OrderedDict()
         self.refresh()
 
@@ -70,17 +71,14 @@ class Run:
         self.gone = not self.folder.is_dir()
         if self.gone:
             return False
-        iterations = [int(path.stem) for path in record.frames(self.folder)]
-        new_frames, self.iterations = iterations != self.iterations, iterations
-        try:
-            status = (self.folder / "metrics.csv").stat()
-            stamp = (status.st_mtime_ns, status.st_size)
-            new_rows = stamp != self._stamp
-            if new_rows:
-                self.rows, self._stamp = record.read_metrics(self.folder)[1], stamp
-        except (OSError, record.RunError):  # being replaced, or damaged: the old rows will do
-            new_rows = False
-        return new_frames or new_rows
+        before = self.iterations
+        with contextlib.suppress(OSError):  # it may vanish just now
+            changed = (self.folder / "frames").stat().st_mtime_ns
+            # The clock of a file system is coarse: of what has just changed, more may come.
+            if changed != self._listed or time.time_ns() - changed < 2e9:
+                self.iterations = [int(path.stem) for path in record.frames(self.folder)]
+                self._listed = changed
+        return self.metrics.refresh() or self.iterations != before
 
     def frame(self, iteration: int) -> Frame | None:
         """The frame of that iteration, or None if it cannot be read."""
@@ -111,29 +109,6 @@ class Run:
             return (self.folder / record.ENDED).read_text()[:200].strip()
         except (OSError, UnicodeDecodeError):
             return None
-
-    def age(self) -> float:
-        """Seconds since the metrics last changed."""
-        return math.inf if self._stamp is None else time.time() - self._stamp[0] / 1e9
-
-    def column(self, name: str) -> FloatArray:
-        """A metric over the rows, (n,), NaN where it is missing or no number."""
-        return np.array([number(row.get(name)) for row in self.rows])
-
-    def row_of(self, iteration: int) -> dict[str, str]:
-        """The metrics of an iteration; empty if there are none."""
-        for row in reversed(self.rows):
-            if row.get("iteration") == str(iteration):
-                return row
-        return {}
-
-
-def number(text: str | None) -> float:
-    """A cell of `metrics.csv` as a number, NaN if it is none."""
-    try:
-        return float(text) if text else math.nan
-    except ValueError:
-        return math.nan
 
 
 def success(frame: Frame) -> tuple[FloatArray, bool]:

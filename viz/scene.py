@@ -289,12 +289,12 @@ def start_server(host: str, port: int) -> viser.ViserServer:
         return viser.ViserServer(host=host, port=port, label="goalgan_bt")
 
 
-def look_at(server: viser.ViserServer, centre: FloatArray, size: float) -> None:
-    """Put the camera where a square of the floor is seen: its middle, (2,), and side, metres."""
-    camera = server.initial_camera
+def look_at(
+    camera: viser.InitialCameraConfig | viser.CameraHandle, centre: FloatArray, size: float
+) -> None:
+    """Put a camera where a square of the floor is seen: its middle, (2,), and side, metres."""
     camera.position = (centre[0], centre[1] - 0.5 * size, 0.92 * size)
     camera.look_at = (centre[0], centre[1], 0.0)
-    camera.up = (0.0, 0.0, 1.0)
 
 
 def legend() -> str:
@@ -302,9 +302,10 @@ def legend() -> str:
     stops = ", ".join(
         f"rgb({r},{g},{b}) {100 * i / (len(STOPS) - 1):.0f}%" for i, (r, g, b) in enumerate(STOPS)
     )
+    dot = "display:inline-block;width:10px;height:10px;border-radius:5px;border:1px solid #333"
     dots = " ".join(
-        f'<span style="white-space:nowrap"><span style="color:rgb{colour};-webkit-text-stroke:'
-        f'1px #333">&#9679;</span> {text}</span>&nbsp;'
+        f'<span style="white-space:nowrap"><span style="{dot};background:rgb{colour}"></span> '
+        f"{text}</span>&nbsp;"
         for text, colour in (
             ("too hard", TOO_HARD),
             ("intermediate", INTERMEDIATE),

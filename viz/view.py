@@ -19,7 +19,7 @@ from goalgan_bt.viz.body import Bodies
 from goalgan_bt.viz.curves import Curves
 from goalgan_bt.viz.download import Export, as_csv
 from goalgan_bt.viz.player import Attempt, Player
-from goalgan_bt.viz.run import Frame, Run, number
+from goalgan_bt.viz.run import Frame, Run
 from goalgan_bt.viz.scene import LAYERS, Scene, legend, look_at, start_server
 from goalgan_bt.viz.words import caption, settings_table, state
 
@@ -122,7 +122,7 @@ class View:
         if not run.iterations:
             return
         index = int(np.clip(index, 0, len(run.iterations) - 1))
-        steps = number(run.row_of(run.iterations[index]).get("steps/train"))
+        steps = run.metrics.at(run.iterations[index], "steps/train")
         with self.server.atomic():
             for i, (other, scene) in enumerate(zip(self.runs, self._scenes, strict=True)):
                 frame = other.frame(run.iterations[index] if i == 0 else report_at(other, steps))
@@ -184,6 +184,8 @@ class View:
     def _serve(self, request: str, value: Any) -> None:
         if request == "slider":
             self._show(int(value))
+        elif request == "dark":
+            self._set_theme(bool(value))
         elif request == "csv" and value is not None:
             self._send_csv(value)
         elif request == "page" and value is not None and self._export is None:
@@ -230,14 +232,19 @@ class View:
         size = first.size + row
         middle = (first.centre + last.centre) / 2
         middle[0] += row / 2
-        middle[0] += 0.1 * size  # the panel covers the right of the page
-        look_at(self.server, middle, size)
+        # The panel covers the right of the page, and on a phone its lower half.
+        look_at(self.server.initial_camera, middle + np.array([0.1 * size, 0.0]), size)
+
+        def fit(client: viser.ClientHandle) -> None:
+            if (aspect := client.camera.aspect) < 1:
+                size_seen = size / max(aspect, 0.2)
+                look_at(client.camera, middle - np.array([0.0, 0.3 * size_seen]), 0.75 * size_seen)
+
+        self.server.on_client_connect(fit)
 
     def _build_panel(self) -> None:
         gui = self.server.gui
-        gui.configure_theme(
-            control_width="medium", show_logo=False, show_share_button=False, dark_mode=True
-        )
+        self._set_theme(dark=True)
         self._status = gui.add_markdown("")
         gui.add_html(legend())
         tabs = gui.add_tab_group()
@@ -267,11 +274,18 @@ class View:
             self._curves = Curves(gui, self.runs)
         with tabs.add_tab("About"):
             gui.add_markdown(about())
+            dark = gui.add_checkbox("Dark", True)
+            dark.on_update(lambda event: self._ask("dark", event.target.value))
             table = gui.add_button("This report as CSV")
             table.on_click(lambda event: self._ask("csv", event.client))
             page = gui.add_button("This run as one HTML page")
             page.on_click(lambda event: self._ask("page", event.client))
             gui.add_markdown("### Settings\n\n" + settings_table(self.runs[0].settings))
+
+    def _set_theme(self, dark: bool) -> None:
+        self.server.gui.configure_theme(
+            control_width="medium", show_logo=False, show_share_button=False, dark_mode=dark
+        )
 
     def _layer_switched(self, name: str, event: Any) -> None:
         self._ask("layer", (name, event.target.value))
@@ -316,8 +330,7 @@ class View:
 
 def report_at(run: Run, steps: float) -> int:
     """The iteration of the last report that a run had made after so many steps."""
-    known = dict(zip(run.column("iteration"), run.column("steps/train"), strict=True))
-    before = [i for i in run.iterations if known.get(i, 0) <= steps]
+    before = [i for i in run.iterations if not run.metrics.at(i, "steps/train") > steps]
     return before[-1] if before else (run.iterations[0] if run.iterations else 0)
 
 

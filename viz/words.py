@@ -1,10 +1,11 @@
 """What a page says of a run."""
 
+import time
 from typing import Any
 
 import numpy as np
 
-from goalgan_bt.viz.run import Run, number, success
+from goalgan_bt.viz.run import Run, success
 
 SILENT = 120.0  # seconds without news after which a run counts as stopped
 
@@ -13,28 +14,28 @@ def state(run: Run) -> str:
     """What goes on in a run, in a few words."""
     if run.gone:
         return "is gone: the folder has vanished; this is the last that was seen of it."
-    if not run.rows:
+    metrics = run.metrics
+    if not len(metrics):
         return "has begun; no iteration is finished yet."
-    row = run.rows[-1]
-    measured = run.column("eval/coverage")
-    measured = measured[np.isfinite(measured)]
-    coverage = f", coverage {measured[-1]:.2f}" if len(measured) else ""
+    coverage = metrics.last("eval/coverage")
     progress = (
-        f"iteration {number(row.get('iteration')):,.0f}, "
-        f"{number(row.get('steps/train')) / 1e6:.2f}M steps, "
-        f"{number(row.get('time/fps')):,.0f} steps/s{coverage}"
+        f"iteration {metrics.last('iteration'):,.0f}, "
+        f"{metrics.last('steps/train') / 1e6:.2f}M steps, "
+        f"{metrics.last('time/fps'):,.0f} steps/s"
+        + (f", coverage {coverage:.2f}" if coverage == coverage else "")
     )
     if (ended := run.ended()) is not None:
         return f"ended ({ended}): {progress}"
-    return f"{'learns' if run.age() < SILENT else 'is silent'}: {progress}"
+    learns = time.time() - metrics.changed < SILENT
+    return f"{'learns' if learns else 'is silent'}: {progress}"
 
 
 def caption(run: Run, iteration: int) -> str:
     """One report in a line of markdown."""
-    frame, row = run.frame(iteration), run.row_of(iteration)
+    frame, steps = run.frame(iteration), run.metrics.at(iteration, "steps/train")
     words = [f"Iteration {iteration:,}"]
-    if row:
-        words.append(f"{number(row.get('steps/train')):,.0f} steps")
+    if steps == steps:
+        words.append(f"{steps:,.0f} steps")
     if frame is not None:
         rate, measured = success(frame)
         kind = "coverage (measured)" if measured else "coverage (estimated)"
