@@ -78,7 +78,7 @@ class Config:
     """Where the page listens; 0.0.0.0 lets everybody on the network in, without a password."""
     viz_port: int = 8080
     """The page's port; if it is busy, the next free one is taken and printed."""
-    report_every: int = 5
+    report_every: int = 1
     """Iterations between two reports (a line on the terminal, a frame in the run folder)."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     value: ValueConfig = field(default_factory=ValueConfig)

@@ -15,7 +15,7 @@ from goalgan_bt.train import train
 torch.set_num_threads(1)
 
 TINY = (
-    "--env point_umaze --iterations 4 --report-every 1 --rollout.num-envs 16 --rollout.steps 20 "
+    "--env point_umaze --iterations 4 --rollout.num-envs 16 --rollout.steps 20 "
     "--threads 1 --coverage.rollouts 1 --gan.pretrain-steps 20 --gan.steps 5 "
     "--backtracking.min-transitions 50"
 )

@@ -23,10 +23,7 @@ pytestmark = [
     pytest.mark.timeout(280),
 ]
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-TRAIN = (
-    "--env point_umaze --threads 1 --report-every 1 --viz none --coverage.every 100000 "
-    "--goals.episodes 200"
-)
+TRAIN = "--env point_umaze --threads 1 --viz none --coverage.every 100000 --goals.episodes 200"
 CAPTION = re.compile(r"^Iteration \d")
 
 

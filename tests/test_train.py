@@ -31,7 +31,7 @@ FAST = (
 
 
 def settings(env, *more):
-    words = f"--env {env} {TINY[env]} {FAST} --threads 1 --report-every 1".split()
+    words = f"--env {env} {TINY[env]} {FAST} --threads 1".split()
     return config.from_command_line([*words, *more])
 
 
@@ -49,7 +49,7 @@ def run(*flags, out):
 def start(out):
     """A run without an end, in the background, and its run folder."""
     process = subprocess.Popen(
-        command("--env", "point_umaze", "--report-every", 1, out=out),
+        command("--env", "point_umaze", out=out),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -185,7 +185,7 @@ def test_a_resumed_learner_takes_new_learning_rates_and_buffers(tmp_path):
 
 
 def test_closed_standard_output_is_one_line(tmp_path):
-    words = command("--env", "point_umaze", "--iterations", 40, "--report-every", 1, out=tmp_path)
+    words = command("--env", "point_umaze", "--iterations", 40, out=tmp_path)
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     process.stdout.readline()
     process.stdout.close()

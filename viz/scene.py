@@ -112,6 +112,13 @@ def segments(lines: FloatArray) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
     return both[whole], step[whole]
 
 
+def drawn(maze: Maze | None, box: FloatArray) -> FloatArray:
+    """The part of a box of goals, (2, goal_dim), that is drawn, (2, 2): of the outer wall only a
+    strip, since the map is what one wants to see."""
+    hidden = 0.0 if maze is None else 0.75 * maze.cell_size
+    return np.asarray(box)[:, :2] + np.array([[hidden], [-hidden]])
+
+
 class Scene:
     """The layers of one run in a viser scene.
 
@@ -133,9 +140,7 @@ class Scene:
     ) -> None:
         self._scene, self._maze, self._prefix = server.scene, maze, prefix
         self._low, self._high = np.asarray(box)[:, :2]
-        # Only a strip of the outer wall is drawn: the map is what one wants to see.
-        hidden = 0.0 if maze is None else 0.75 * maze.cell_size
-        self._first, self._last = self._low + hidden, self._high - hidden
+        self._first, self._last = drawn(maze, box)
         self._scene.add_frame(prefix, show_axes=False, position=(*offset, 0.0))
         self._groups = {
             name: self._scene.add_frame(f"{prefix}/{name}", show_axes=False, visible=shown)

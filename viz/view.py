@@ -20,7 +20,7 @@ from goalgan_bt.viz.curves import Curves
 from goalgan_bt.viz.download import Export, as_csv
 from goalgan_bt.viz.player import Attempt, Player
 from goalgan_bt.viz.run import Frame, Run
-from goalgan_bt.viz.scene import LAYERS, Scene, legend, look_at, start_server
+from goalgan_bt.viz.scene import LAYERS, Scene, drawn, legend, look_at, start_server
 from goalgan_bt.viz.words import caption, settings_table, state
 
 LOOK_EVERY = 1.0  # seconds between two looks at the run folders
@@ -43,7 +43,8 @@ class View:
         self._requests: queue.Queue[tuple[str, Any]] = queue.Queue(maxsize=100)
         boxes = [run.box() for run in runs]
         # Metres from one maze to the next, the same for all: GAP sides of the largest.
-        self._spread = GAP * max(float(np.ptp(box[:, :2], axis=0).max()) for box in boxes)
+        sides = [np.ptp(drawn(run.maze, box), axis=0) for run, box in zip(runs, boxes, strict=True)]
+        self._spread = GAP * float(np.max(sides))
         self._scenes = [
             Scene(self.server, run.maze, box, f"/run{i}", offset=(i * self._spread, 0.0))
             for i, (run, box) in enumerate(zip(runs, boxes, strict=True))
@@ -184,8 +185,6 @@ class View:
     def _serve(self, request: str, value: Any) -> None:
         if request == "slider":
             self._show(int(value))
-        elif request == "dark":
-            self._set_theme(bool(value))
         elif request == "csv" and value is not None:
             self._send_csv(value)
         elif request == "page" and value is not None and self._export is None:
@@ -229,11 +228,12 @@ class View:
     def _place_camera(self) -> None:
         first, last = self._scenes[0], self._scenes[-1]
         row = self._spread * (len(self._scenes) - 1)
-        size = first.size + row
+        width = first.size + row
+        size = max(first.size, width / 1.25)  # a page is wide
         middle = (first.centre + last.centre) / 2
         middle[0] += row / 2
         # The panel covers the right of the page, and on a phone its lower half.
-        look_at(self.server.initial_camera, middle + np.array([0.1 * size, 0.0]), size)
+        look_at(self.server.initial_camera, middle + np.array([0.11 * width, 0.0]), size)
 
         def fit(client: viser.ClientHandle) -> None:
             if (aspect := client.camera.aspect) < 1:
@@ -244,7 +244,9 @@ class View:
 
     def _build_panel(self) -> None:
         gui = self.server.gui
-        self._set_theme(dark=True)
+        gui.configure_theme(
+            control_width="medium", show_logo=False, show_share_button=False, dark_mode=True
+        )
         self._status = gui.add_markdown("")
         gui.add_html(legend())
         tabs = gui.add_tab_group()
@@ -274,18 +276,11 @@ class View:
             self._curves = Curves(gui, self.runs)
         with tabs.add_tab("About"):
             gui.add_markdown(about())
-            dark = gui.add_checkbox("Dark", True)
-            dark.on_update(lambda event: self._ask("dark", event.target.value))
             table = gui.add_button("This report as CSV")
             table.on_click(lambda event: self._ask("csv", event.client))
             page = gui.add_button("This run as one HTML page")
             page.on_click(lambda event: self._ask("page", event.client))
             gui.add_markdown("### Settings\n\n" + settings_table(self.runs[0].settings))
-
-    def _set_theme(self, dark: bool) -> None:
-        self.server.gui.configure_theme(
-            control_width="medium", show_logo=False, show_share_button=False, dark_mode=dark
-        )
 
     def _layer_switched(self, name: str, event: Any) -> None:
         self._ask("layer", (name, event.target.value))
