@@ -106,7 +106,7 @@ class Record:
         for frame in frames(folder):
             if int(frame.stem) > iteration:
                 frame.unlink()
-        self._events = _tensorboard(folder)
+        self._events = _tensorboard(folder, int(self._rows[-1]["steps/train"]) if self._rows else 0)
 
     def metrics(self, row: dict[str, float]) -> None:
         """Append a row; a value that is missing or NaN is an empty cell."""
@@ -229,9 +229,10 @@ def read_frame(path: Path) -> dict[str, np.ndarray[Any, Any]]:
     return arrays
 
 
-def _tensorboard(folder: Path) -> Any:
+def _tensorboard(folder: Path, steps: int) -> Any:
+    """A writer of TensorBoard events; those after so many steps, of before a resume, are void."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
         return None
-    return SummaryWriter(str(folder))
+    return SummaryWriter(str(folder), purge_step=steps + 1 if steps else None)

@@ -98,3 +98,16 @@ def test_meta_holds_the_maze_and_the_versions(tmp_path):
 def test_a_folder_that_is_no_run_says_so(tmp_path, read):
     with pytest.raises(RunError, match="is no run"):
         read(tmp_path)
+
+
+def test_tensorboard_forgets_what_a_resumed_run_does_again(tmp_path):
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    first = Record(tmp_path)
+    for i in (1, 2, 3):
+        first.metrics({"iteration": i, "steps/train": 100 * i, "trpo/kl": 0.1 * i})
+    first.close("killed")
+    again = Record(tmp_path, 1)
+    again.metrics({"iteration": 2, "steps/train": 200, "trpo/kl": 0.7})
+    again.close("complete")
+    events = accumulator.EventAccumulator(str(tmp_path)).Reload().Scalars("trpo/kl")
+    assert [(e.step, round(e.value, 3)) for e in events] == [(100, 0.1), (200, 0.7)]
