@@ -68,8 +68,15 @@ class Learner:
         Besides the bounds on success, a goal must be near a place where the agent has been: the
         estimator averages over neighbours, and beside a mastered place there may be a wall.
         """
-        near = self.visited.distance_to(goals) <= self.cfg.near
-        return intermediate(success, self.cfg.r_min, self.cfg.r_max) & near
+        return intermediate(success, self.cfg.r_min, self.cfg.r_max) & self._near(goals)
+
+    def estimated_success(self, goals: FloatArray) -> FloatArray:
+        """What a map shows: success at goals (n, goal_dim) as estimated, (n,), and 0 far from any
+        place where the agent has been."""
+        return np.where(self._near(goals), self.estimator(goals), 0.0)
+
+    def _near(self, goals: FloatArray) -> BoolArray:
+        return self.visited.distance_to(goals) <= self.cfg.near
 
     def _modules(self) -> dict[str, Any]:
         """Everything with torch's `state_dict` and `load_state_dict`: networks, optimisers."""

@@ -208,7 +208,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                 coverage = metrics["eval/coverage"] = float(measured.mean())
                 metrics["eval/coverage_deterministic"] = float(by_mean.mean())
 
-            estimate = learner.estimator(test_goals)
+            estimate = learner.estimated_success(test_goals)
             metrics |= group("steps", learner.steps)
             metrics |= group("time", clock.metrics(learner.steps["train"]))
             metrics |= {

@@ -50,10 +50,10 @@ def movie(folder: Path, path: Path) -> None:
 
 def _picture(folder: Path, frame: Path) -> NDArray[np.uint8]:
     """One report, (height, width, 3)."""
-    figure = Figure(figsize=(9.6, 4.2), dpi=80, layout="constrained")
+    figure = Figure(figsize=(9, 3.9), dpi=90, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, width_ratios=[1, 1.2])
-    image = pictures.coverage_map(left, folder, frame)
+    image = pictures.coverage_map(left, folder, frame, goals=16)
     left.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=3, frameon=False)
     figure.colorbar(image, ax=left, label="success", shrink=0.8)
     pictures.coverage_curve(right, [folder], until=int(frame.stem))

@@ -50,7 +50,7 @@ def coverage_curve(ax: Axes, folders: list[Path], until: int | None = None) -> N
     ax.legend(fontsize=7, frameon=False, loc="upper left")
 
 
-def coverage_map(ax: Axes, folder: Path, frame: Path, goals: bool = True) -> Any:
+def coverage_map(ax: Axes, folder: Path, frame: Path, goals: float = 7.0) -> Any:
     """One report seen from above: tiles by success, goals by label, recall traces.
 
     Tiles show the measured coverage, or the learner's own estimate where the report has none.
@@ -59,7 +59,7 @@ def coverage_map(ax: Axes, folder: Path, frame: Path, goals: bool = True) -> Any
         ax: where to draw.
         folder: the run.
         frame: one of its frames.
-        goals: draw goals and traces too.
+        goals: the area of a goal's dot, square points; 0 leaves goals and traces away.
 
     Returns:
         What `Figure.colorbar` needs.
@@ -84,7 +84,7 @@ def coverage_map(ax: Axes, folder: Path, frame: Path, goals: bool = True) -> Any
         ax.add_collection(LineCollection(list(lines), colors="#111111", linewidths=0.5, alpha=0.5))
         for label, (text, shade) in LABELS.items():
             x, y = arrays["goals"][arrays["label"] == label].T
-            ax.scatter(x, y, s=7, color=shade, label=text, lw=0.3, edgecolors="white")
+            ax.scatter(x, y, s=goals, color=shade, label=text, lw=0.3, edgecolors="white")
     ax.plot(0, 0, marker="*", color="white", markeredgecolor="#111111", markersize=9)
     ax.set(xlim=(maze.low[0], maze.high[0]), ylim=(maze.low[1], maze.high[1]), aspect="equal")
     ax.set(xticks=[], yticks=[])
