@@ -50,7 +50,7 @@ def movie(folder: Path, path: Path) -> None:
 
 def _picture(folder: Path, frame: Path) -> NDArray[np.uint8]:
     """One report, (height, width, 3)."""
-    figure = Figure(figsize=(9, 3.9), dpi=90, layout="constrained")
+    figure = Figure(figsize=(9, 4), dpi=90, layout="constrained")  # MP4 wants even sides
     canvas = FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, width_ratios=[1, 1.2])
     image = pictures.coverage_map(left, folder, frame, goals=16)
