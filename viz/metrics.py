@@ -3,6 +3,7 @@
 import csv
 import math
 import os
+from array import array
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ class Metrics:
     """
 
     _names: list[str]
-    _columns: dict[str, list[float]]
+    _columns: dict[str, "array[float]"]
     _row_of: dict[int, int]  # of an iteration
     _read: int  # bytes
     _stamp: tuple[int, int, int]  # of the file: inode, size, time
@@ -54,7 +55,7 @@ class Metrics:
         for cells in csv.reader(whole.decode(errors="replace").splitlines()):
             if not self._names:
                 self._names = cells
-                self._columns = {name: [] for name in cells}
+                self._columns = {name: array("d") for name in cells}
             elif len(cells) == len(self._names):  # else: cut short and gone on with by a resume
                 row = dict(zip(self._names, map(_number, cells), strict=True))
                 if math.isfinite(iteration := row.get("iteration", math.nan)):
@@ -65,11 +66,11 @@ class Metrics:
 
     def column(self, name: str) -> FloatArray:
         """A metric over the rows, (n,), NaN where it is missing or no number."""
-        return np.array(self._columns.get(name, [math.nan] * len(self)))
+        return np.array(self._columns.get(name, [math.nan] * len(self)), dtype=float)
 
     def last(self, name: str) -> float:
         """The last value of a metric that is known, NaN if none is."""
-        return next((x for x in reversed(self._columns.get(name, [])) if x == x), math.nan)
+        return next((x for x in reversed(self._columns.get(name, array("d"))) if x == x), math.nan)
 
     def at(self, iteration: int, name: str) -> float:
         """A metric of an iteration, NaN if it is not known."""
