@@ -54,7 +54,7 @@ def main() -> int:
         say(f"view: {view.address}" + (f" (port {cfg.port} was busy)" if busy else ""))
         if cfg.host in ("0.0.0.0", "::"):
             say("view: everybody who can reach this machine can use it: there is no password")
-        os.nice(10)  # looking must not slow learning
+        os.nice(19)  # looking must not slow learning
         if cfg.with_parent:
             threading.Thread(target=_wait_for_parent, daemon=True).start()
         # viser tells of every connection, and who started this may listen no more.
