@@ -25,6 +25,7 @@ def make(
     integrator: str = "implicitfast",
     dim: int = 2,
     map_file: Path | None = None,
+    maze: mazes.Maze | None = None,
 ) -> GoalEnv:
     """N simulations of the environment of that name.
 
@@ -38,6 +39,7 @@ def make(
         integrator: `implicitfast` or `rk4`, for MuJoCo bodies.
         dim: dimensions of `point_nd`, 2 to 6.
         map_file: a text map that replaces the layout (see `goalgan_bt.envs.maze`).
+        maze: a maze that replaces both, for example the one that a run has recorded.
 
     Raises:
         ValueError: for an unknown name or a dim out of range.
@@ -51,7 +53,8 @@ def make(
         return PointND(dim, num_envs, horizon or 200, action_repeat)
     body, layout = name.split("_")
     constructor, base_horizon = BODIES[body]
-    maze = mazes.layout(layout) if map_file is None else mazes.load(map_file)
+    if maze is None:
+        maze = mazes.layout(layout) if map_file is None else mazes.load(map_file)
     if horizon is None:
         scale = maze.longest_path / mazes.layout("umaze").longest_path
         horizon = max(base_horizon, 100 * round(base_horizon * scale / 100))

@@ -3,7 +3,13 @@
 python -m goalgan_bt.plot runs/ant_umaze-20261122-101500-s0
 """
 
+import os
+import signal
 import sys
+
+if __name__ == "__main__":  # nothing to lose: it goes at once, without a word
+    signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,8 +36,10 @@ def main() -> int:
     """The command line; returns the exit code."""
     try:
         cfg = parse(PlotConfig, None, "python -m goalgan_bt.plot")
-        if not cfg.runs or cfg.maps < 1:
-            raise UsageError("name at least one run folder, and ask for at least one map")
+        if not cfg.runs or not 1 <= cfg.maps <= 50:
+            raise UsageError("name at least one run folder, and ask for 1 to 50 maps")
+        if cfg.out is not None and cfg.out.suffix != ".png":
+            raise UsageError(f"cannot write '{cfg.out}': its name must end in .png")
         try:
             from goalgan_bt.viz import pictures
         except ImportError:

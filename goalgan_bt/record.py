@@ -19,8 +19,6 @@ import platform
 import subprocess
 import sys
 import time
-import zipfile
-import zlib
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -210,7 +208,7 @@ def read_meta(folder: Path) -> dict[str, Any]:
 
 def frames(folder: Path) -> list[Path]:
     """The frames of a run, oldest first."""
-    return sorted(f for f in (folder / "frames").glob("*.npz") if f.stem.isdigit())
+    return sorted(f for f in (folder / "frames").glob("*.npz") if f.stem.isdecimal())
 
 
 def read_frame(path: Path) -> dict[str, np.ndarray[Any, Any]]:
@@ -221,11 +219,15 @@ def read_frame(path: Path) -> dict[str, np.ndarray[Any, Any]]:
     """
     try:
         with np.load(path, allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            arrays = {name: np.asarray(data[name]) for name in data.files}
+    except Exception as error:  # a damaged archive raises many kinds
         raise RunError(f"cannot read the frame {path}: {error}") from None
-    if "coverage" not in arrays:
-        raise RunError(f"{path} is no frame of a run")
+    for name, dims in (("goals", 2), ("test_goals", 2), ("coverage", 1)):
+        array = arrays.get(name)
+        if array is None or array.dtype.kind not in "fiub" or array.ndim != dims:
+            raise RunError(f"{path} is no frame of a run: its {name} are missing or damaged")
+    if len(arrays["coverage"]) != len(arrays["test_goals"]) or arrays["test_goals"].shape[1] < 2:
+        raise RunError(f"{path} is no frame of a run: coverage and test_goals do not fit")
     return arrays
 
 

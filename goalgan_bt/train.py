@@ -41,7 +41,7 @@ from goalgan_bt.config import Config
 from goalgan_bt.coverage import success_rate
 from goalgan_bt.decoder import decode
 from goalgan_bt.envs.batch import GoalEnv
-from goalgan_bt.envs.maze import MapError
+from goalgan_bt.envs.maze import MapError, Maze
 from goalgan_bt.learner import Learner
 from goalgan_bt.progress import Progress, complain, say
 from goalgan_bt.record import Record
@@ -298,8 +298,8 @@ def finished(cfg: Config, learner: Learner, seconds: float) -> float:
     )
 
 
-def make_env(cfg: Config, num_envs: int) -> GoalEnv:
-    """The environment that the settings name."""
+def make_env(cfg: Config, num_envs: int, maze: Maze | None = None) -> GoalEnv:
+    """The environment that the settings name, in another maze if one is given."""
     return envs.make(
         cfg.env,
         num_envs,
@@ -309,6 +309,7 @@ def make_env(cfg: Config, num_envs: int) -> GoalEnv:
         integrator=cfg.integrator,
         dim=cfg.dim,
         map_file=cfg.map,
+        maze=maze,
     )
 
 

@@ -41,7 +41,7 @@ def test_a_page_holds_the_whole_run(folder, tmp_path):
 
 
 def test_names_in_a_run_folder_are_text_not_html(folder, tmp_path):
-    evil = folder.rename(tmp_path / "a<script>x")
+    evil = folder.rename(tmp_path / "a<!--<script>x")
     config = json.loads((evil / "config.json").read_text())
     config["env"] = "</script><script>alert(1)</script>"
     (evil / "config.json").write_text(json.dumps(config))
@@ -78,7 +78,9 @@ def test_a_movie_shows_every_report_and_holds_the_last(folder, tmp_path, kind):
     ("flags", "message"),
     [
         (["--export", "nowhere/run.html"], "cannot write"),
-        (["--movie", "map.avi"], ".gif or a .mp4"),
+        (["--export", "run.txt"], "must end in .html"),
+        (["--export", "."], "must end in .html"),
+        (["--movie", "map.avi"], ".gif or .mp4"),
         (["--movie", "nowhere/map.gif"], "cannot write"),
     ],
 )

@@ -1,6 +1,8 @@
 """The page: what it reads, what it draws, what people can do to it."""
 
+import json
 import shutil
+import socket
 import time
 
 import msgspec
@@ -10,18 +12,21 @@ import torch
 import viser
 import websockets.sync.client
 import zstandard
-from conftest import run_module, serve
+from conftest import TINY, run_module, serve
 from viser import _messages
 
-from goalgan_bt import record
+from goalgan_bt import config, record
 from goalgan_bt.envs import maze as mazes
+from goalgan_bt.train import train
 from goalgan_bt.viz.curves import joined, thinned
 from goalgan_bt.viz.download import as_csv
 from goalgan_bt.viz.metrics import Metrics
 from goalgan_bt.viz.player import Player
+from goalgan_bt.viz.published import published
 from goalgan_bt.viz.run import Run, success
 from goalgan_bt.viz.scene import colours, segments, tile_image
 from goalgan_bt.viz.view import View, report_at
+from goalgan_bt.viz.words import settings_table
 
 
 @pytest.fixture
@@ -74,14 +79,18 @@ def test_metrics_are_read_as_they_grow_break_off_and_are_replaced(tmp_path):
     (tmp_path / "new").replace(path)
     assert metrics.refresh() and metrics.column("b").tolist() == [9.0]
     assert np.isnan(metrics.column("a")).all()
+    path.write_text("iteration,c\n1,10\n2,20\n2,21\n3,30\n")  # the same file, another table
+    assert metrics.refresh() and metrics.at(2, "c") == 21 and metrics.at(3, "c") == 30
+    assert len(metrics) == 4
     path.unlink()
-    assert not metrics.refresh() and len(metrics) == 1
+    assert not metrics.refresh() and len(metrics) == 4
 
 
 def test_a_frame_that_is_written_anew_is_read_anew(folder):
     run = Run(folder)
     assert run.frame(2)["goals"].shape != (1, 2)
-    record.Record(folder, 4).frame(2, goals=np.zeros((1, 2)), coverage=np.zeros(3))
+    few = {"goals": np.zeros((1, 2)), "test_goals": np.zeros((3, 2)), "coverage": np.zeros(3)}
+    record.Record(folder, 4).frame(2, **few)
     assert run.frame(2)["goals"].shape == (1, 2)
 
 
@@ -91,10 +100,13 @@ def test_a_damaged_frame_is_no_frame(folder, damage):
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2] if damage is None else damage)
     assert Run(folder).frame(3) is None
-    flipped = bytearray(whole)
-    flipped[len(whole) // 2] ^= 255
-    path.write_bytes(flipped)
-    Run(folder).frame(3)  # whatever it gives, it does not raise
+    rng = np.random.default_rng(0)
+    run = Run(folder)
+    for _ in range(200):
+        flipped = bytearray(whole)
+        flipped[rng.integers(len(whole))] ^= 1 << rng.integers(8)
+        path.write_bytes(flipped)
+        run.frame(3)  # whatever it gives, it does not raise
 
 
 def test_a_folder_that_vanishes_leaves_what_was_seen(folder):
@@ -229,11 +241,85 @@ def test_the_page_outlives_its_folder(view, folder):
 
 
 def test_several_runs_stand_side_by_side(trained, folder):
-    view = View([Run(trained), Run(folder)], port=0)
+    for i in (2, 3, 4):
+        (folder / f"frames/{i:06d}.npz").unlink()  # the first is behind the second
+    view = View([Run(folder), Run(trained)], port=0)
     assert node(view, "/run1").position[0] > node(view, "/run0").position[0] + 6
+    assert view._slider.max == 3 and "Iteration 4" in view._caption.content
+    pictures = [node(view, f"/run{i}/coverage/node").image.copy() for i in range(2)]
+    assert not np.array_equal(*pictures)
+    view._follow.value = False
+    view._ask("slider", 0)
     view.tick(time.monotonic())
+    assert np.array_equal(node(view, "/run0/coverage/node").image, pictures[0])
+    assert not np.array_equal(node(view, "/run1/coverage/node").image, pictures[1])
     view.close()
-    assert report_at(Run(folder), 0) == 1 and report_at(Run(folder), np.inf) == 4
+    assert report_at(Run(trained), 0) == 1 and report_at(Run(trained), np.inf) == 4
+
+
+def test_what_stands_in_a_folder_is_shown_as_text(folder):
+    evil = folder.rename(folder.parent / "a<img src=x>![i](b)|**c**`")
+    (evil / "ended.txt").write_text("<script>x</script>\n\n# big")
+    settings = json.loads((evil / "config.json").read_text()) | {"<b>": "![i](<c>)"}
+    (evil / "config.json").write_text(json.dumps(settings))
+    run = Run(evil)
+    view = View([run], port=0)
+    for text in (view._status.content, settings_table(run.settings)):
+        assert not set("<>![]`#") & set(text.replace("&#", ""))
+    assert "c&#42;&#42;" in view._status.content
+    view.close()
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("frames/000004.npz", "no archive"),
+        ("frames/²².npz", "not a number"),
+        ("metrics.csv", 'iteration,steps/train\n1,"' + 200_000 * "x"),
+        ("metrics.csv", "a,b\n1,2\n"),
+        ("checkpoint.pt", "half"),
+        ("ended.txt", "\udcff"),
+    ],
+)
+def test_no_file_ends_the_page(folder, file, text):
+    (folder / file).write_text(text, errors="surrogatepass")
+    view = View([Run(folder)], port=0)
+    view._ask("csv", None)
+    view._ask("all", None)
+    for _ in range(3):
+        view.tick(time.monotonic())
+    assert "Iteration" in view._caption.content and not view._trouble
+    view.close()
+
+
+def test_trouble_is_told_once_and_does_not_end_the_page(view, monkeypatch, capsys):
+    def fail(_):
+        raise RuntimeError("what nobody thought of")
+
+    monkeypatch.setattr(view, "_look_again", fail)
+    for _ in range(5):
+        view.tick(time.monotonic())
+    assert capsys.readouterr().err.count("what nobody thought of") == 1
+
+
+def test_a_run_without_walls_is_shown(tmp_path):
+    words = TINY.replace("point_umaze", "point_nd --dim 4").split()
+    record.write_meta(tmp_path, None)
+    train(config.from_command_line(words), tmp_path)
+    view = View([Run(tmp_path)], port=0)
+    view._ask("all", None)
+    view.tick(time.monotonic())
+    assert "All tiles" in view._describe_attempt(time.monotonic()) and not view._trouble
+    view.close()
+
+
+def test_the_body_walks_in_the_maze_that_was_recorded(folder):
+    """Not in the map's file, which may have changed or be elsewhere."""
+    settings = json.loads((folder / "config.json").read_text()) | {"map": "nowhere/my.txt"}
+    (folder / "config.json").write_text(json.dumps(settings))
+    player = Player(folder)
+    assert player.take_newest() and player.env.maze == Run(folder).maze
+    assert published(settings) == () and len(published(settings | {"map": None})) == 2
 
 
 # What people can do to it.
@@ -287,8 +373,12 @@ def connected(view, origin=None):
     )
 
 
-def send(socket, message):
-    socket.send(msgspec.msgpack.encode(message.as_serializable_dict()))
+CAMERA = (1.0, 0, 0, 0), (0.0, 0, 5), 1.0, 0.1, 100.0, 600, 800, (0.0, 0, 0), (0.0, 1, 0)
+LOOK = _messages.ViewerCameraMessage(*CAMERA)  # who has a camera is a client
+
+
+def send(browser, message):
+    browser.send(msgspec.msgpack.encode(message.as_serializable_dict()))
 
 
 def unpacked(data):
@@ -307,9 +397,8 @@ def wait(seconds, condition, step):
 
 
 def test_the_run_is_sent_as_one_page(view, folder):
-    with connected(view) as socket:
-        camera = (1.0, 0, 0, 0), (0.0, 0, 5), 1.0, 0.1, 100.0, 600, 800, (0.0, 0, 0), (0.0, 1, 0)
-        send(socket, _messages.ViewerCameraMessage(*camera))  # who looks is a client
+    with connected(view) as browser:
+        send(browser, LOOK)
         wait(10, view.server.get_clients, lambda: None)
         (client,) = view.server.get_clients().values()
         view._ask("page", client)
@@ -318,21 +407,35 @@ def test_the_run_is_sent_as_one_page(view, folder):
         wait(60, lambda: view._export is None, lambda: view.tick(time.monotonic()))
         received = b""
         while b"FileTransferStartDownload" not in received:
-            received = unpacked(socket.recv(timeout=20))
+            received = unpacked(browser.recv(timeout=20))
     assert f"{folder.name}.html".encode() in received
 
 
-def test_a_foreign_page_changes_no_file_and_ends_nothing(view, folder):
-    """A page of another origin sends nonsense to every control there is."""
+@pytest.mark.parametrize("origin", ["https://evil.example", "http://localhost:1", "null"])
+def test_a_page_of_another_site_is_not_let_in(view, origin):
+    with pytest.raises(websockets.exceptions.InvalidStatus, match="403"), connected(view, origin):
+        pass
+
+
+def test_a_foreign_name_that_points_here_is_not_let_in(view):
+    with socket.create_connection(("127.0.0.1", view.server.get_port()), timeout=10) as line:
+        line.sendall(b"GET / HTTP/1.1\r\nHost: evil.example\r\n\r\n")
+        assert b" 403 " in line.recv(1000).splitlines()[0]
+
+
+def test_nonsense_from_a_browser_changes_no_file_and_ends_nothing(view, folder):
+    """Someone sends nonsense to every control there is."""
     before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
     controls = list(view.server.gui._gui_input_handle_from_uuid)
     assert len(controls) >= 13
     nonsense = ("../../etc/passwd", "__import__('os').remove('x')", -(10**9), None, [1], {"a": 1})
-    with connected(view, origin="https://evil.example") as socket:
+    own = f"http://127.0.0.1:{view.server.get_port()}"
+    with connected(view, own) as browser:
+        send(browser, LOOK)
         for uuid in controls:
             for value in nonsense:
-                send(socket, _messages.GuiUpdateMessage(uuid, {"value": value}))
-        time.sleep(0.5)
+                send(browser, _messages.GuiUpdateMessage(uuid, {"value": value}))
+        wait(10, lambda: view._requests.qsize() > 10, lambda: None)
         for _ in range(50):
             view.tick(time.monotonic())
             time.sleep(0.01)
@@ -340,6 +443,16 @@ def test_a_foreign_page_changes_no_file_and_ends_nothing(view, folder):
     view._follow.value = True
     view._look()
     assert "Iteration 4" in view._caption.content
+
+
+def test_many_wishes_are_one_attempt(view, monkeypatch):
+    begun = []
+    monkeypatch.setattr(view, "_begin", begun.append)
+    for _ in range(50):
+        view._ask("all", None)
+    view._ask("goal", np.array([0.2, 0.0]))
+    view.tick(time.monotonic())
+    assert [goals.shape for goals in begun] == [(1, 2)]
 
 
 # The command.

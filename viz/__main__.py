@@ -8,6 +8,8 @@ if __name__ == "__main__":  # a page has nothing to lose: it goes at once, witho
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
     signal.signal(signal.SIGTERM, lambda *_: os._exit(2))
 
+import importlib.util
+import ipaddress
 import socket
 import threading
 from dataclasses import dataclass
@@ -41,56 +43,66 @@ def main() -> int:
     """The command line; returns the exit code."""
     try:
         cfg = from_command_line()
-        if cfg.export is not None or cfg.movie is not None:
-            return write(cfg)
-        # Only now: this imports torch and MuJoCo, and --help shall not wait for them.
-        from goalgan_bt.viz.run import Run
-        from goalgan_bt.viz.view import View
-
-        family = socket.AF_INET6 if ":" in cfg.host else socket.AF_INET
-        socket.create_server((cfg.host, 0), family=family).close()  # can we listen there?
-        view = View([Run(folder) for folder in cfg.runs], cfg.host, cfg.port)
-        busy = cfg.port not in (0, view.server.get_port())
-        say(f"view: {view.address}" + (f" (port {cfg.port} was busy)" if busy else ""))
-        if cfg.host in ("0.0.0.0", "::"):
-            say("view: everybody who can reach this machine can use it: there is no password")
-        os.nice(19)  # looking must not slow learning
         if cfg.with_parent:
             threading.Thread(target=_wait_for_parent, daemon=True).start()
-        # viser tells of every connection, and who started this may listen no more.
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
-        view.spin()
-    except OSError as error:
-        complain(f"cannot listen on {cfg.host}: {error}")
-        return 2
-    except ValueError as error:
+        if cfg.export is not None or cfg.movie is not None:
+            write(cfg)
+        else:
+            serve(cfg)
+    except (OSError, ValueError) as error:
         complain(str(error))
         return 2
     return 0
 
 
-def write(cfg: ViewConfig) -> int:
-    """Write the files that were asked for; returns the exit code."""
-    try:
-        if cfg.export is not None:
-            from goalgan_bt.viz.export import export
-            from goalgan_bt.viz.run import Run
+def serve(cfg: ViewConfig) -> None:
+    """Keep a page alive until a signal ends this process.
 
-            export(Run(cfg.runs[0]), cfg.export)
-            say(f"{cfg.export} ({cfg.export.stat().st_size / 1e6:.1f} MB)")
-        if cfg.movie is not None:
-            try:
-                from goalgan_bt.viz.movie import movie
-            except ImportError:
-                raise UsageError(
-                    'a movie needs the extra: pip install "goalgan_bt[plots]"'
-                ) from None
-            movie(cfg.runs[0], cfg.movie)
-            say(f"{cfg.movie} ({cfg.movie.stat().st_size / 1e6:.1f} MB)")
-    except OSError as error:
-        complain(f"cannot write: {error}")
-        return 2
-    return 0
+    Raises:
+        ValueError: if a folder is no run, or one cannot listen at that address.
+    """
+    # Only now: this imports torch and MuJoCo, and --help shall not wait for them.
+    from goalgan_bt.viz.run import Run
+    from goalgan_bt.viz.view import View
+
+    os.nice(19)  # looking must not slow learning; threads take it from the one that starts them
+    port = _free_port(cfg.host, cfg.port)
+    view = View([Run(folder) for folder in cfg.runs], cfg.host, port)
+    busy = cfg.port not in (0, view.server.get_port())
+    say(f"view: {view.address}" + (f" (port {cfg.port} was busy)" if busy else ""))
+    if not _is_loopback(cfg.host):
+        say("view: everybody who can reach this machine can use it: there is no password")
+    # viser tells of every connection, and who started this may listen no more.
+    sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+    view.spin()
+
+
+def write(cfg: ViewConfig) -> None:
+    """Write the files that were asked for.
+
+    Raises:
+        ValueError: if the run holds nothing to show, or a library is missing.
+        OSError: if a file cannot be written.
+    """
+    if cfg.export is not None:
+        _check_target(cfg.export, (".html", ".htm"))
+    if cfg.movie is not None:
+        _check_target(cfg.movie, (".gif", ".mp4"))
+        needs = ("matplotlib", "imageio") + (("av",) if cfg.movie.suffix.lower() == ".mp4" else ())
+        if missing := [name for name in needs if importlib.util.find_spec(name) is None]:
+            extra = "movie" if "av" in missing else "plots"
+            raise UsageError(f'{missing[0]} is missing: pip install "goalgan_bt[{extra}]"')
+    if cfg.export is not None:
+        from goalgan_bt.viz.export import export
+        from goalgan_bt.viz.run import Run
+
+        export(Run(cfg.runs[0]), cfg.export)
+        say(f"{cfg.export} ({cfg.export.stat().st_size / 1e6:.1f} MB)")
+    if cfg.movie is not None:
+        from goalgan_bt.viz.movie import movie
+
+        movie(cfg.runs[0], cfg.movie)
+        say(f"{cfg.movie} ({cfg.movie.stat().st_size / 1e6:.1f} MB)")
 
 
 def from_command_line(argv: list[str] | None = None) -> ViewConfig:
@@ -105,9 +117,40 @@ def from_command_line(argv: list[str] | None = None) -> ViewConfig:
         raise UsageError("name at least one run folder: python -m goalgan_bt.viz RUN")
     if len(cfg.runs) > 1 and (cfg.export is not None or cfg.movie is not None):
         raise UsageError("--export and --movie show one run: name only one")
+    if not cfg.host:
+        raise UsageError("--host must name an address: 127.0.0.1 is this machine alone")
     if not 0 <= cfg.port <= 65535:
         raise UsageError(f"--port must be between 0 and 65535, not {cfg.port}")
     return cfg
+
+
+def _check_target(path: Path, kinds: tuple[str, ...]) -> None:
+    if path.suffix.lower() not in kinds:
+        raise UsageError(f"cannot write '{path}': its name must end in {' or '.join(kinds)}")
+    if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+        raise UsageError(f"cannot write '{path}': choose a file in a folder that can be written")
+
+
+def _free_port(host: str, port: int) -> int:
+    """That port, or a later one if it is busy.
+
+    Raises:
+        UsageError: if one cannot listen at that address at all.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    for candidate in [*range(port, min(port + 100, 65536)), 0]:
+        try:
+            socket.create_server((host, candidate), family=family).close()
+            return candidate
+        except OSError as error:
+            reason = error
+    raise UsageError(f"cannot listen on {host}: {reason}")
+
+
+def _is_loopback(host: str) -> bool:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    addresses = {str(found[4][0]) for found in socket.getaddrinfo(host, None, family)}
+    return all(ipaddress.ip_address(address).is_loopback for address in addresses)
 
 
 def _wait_for_parent() -> None:

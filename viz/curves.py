@@ -8,7 +8,7 @@ import viser
 from viser import uplot
 
 from goalgan_bt.envs.maze import FloatArray
-from goalgan_bt.viz.published import PUBLISHED
+from goalgan_bt.viz.published import published
 from goalgan_bt.viz.run import Run
 
 MOST = 400  # points of a curve that are sent to the page
@@ -77,7 +77,7 @@ def joined(x: FloatArray, y: FloatArray) -> FloatArray:
 def series(run: Run, plot: Plot) -> tuple[FloatArray, ...]:
     """Million steps and every curve of a plot, each (n,)."""
     if not len(run.metrics):
-        return tuple(np.zeros((1 + len(plot.curves), 1)))
+        return np.zeros(1), *np.full((len(plot.curves), 1), np.nan)
     column = run.metrics.column
     steps = column("steps/train") / 1e6
     rows = thinned(len(steps))
@@ -88,7 +88,7 @@ def levels(run: Run, plot: Plot) -> list[tuple[str, float]]:
     """The coverage that was published for a run's task, as lines of a plot: (name, coverage)."""
     return [
         (f"{line.method}, {line.last[0] / 1e6:.0f}M steps", line.last[1])
-        for line in (PUBLISHED.get(run.env, ()) if plot is PLOTS[0] else ())
+        for line in (published(run.settings) if plot is PLOTS[0] else ())
     ]
 
 

@@ -32,9 +32,12 @@ class Export:
         self._name, self._client = f"{folder.name}.html", client
         self._directory = tempfile.TemporaryDirectory()
         self._path = Path(self._directory.name) / "page.html"
-        words = [sys.executable, "-m", "goalgan_bt.viz", str(folder), "--export", str(self._path)]
+        words = [sys.executable, "-m", "goalgan_bt.viz", str(folder.resolve())]
         self._process = subprocess.Popen(
-            words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+            [*words, "--export", str(self._path), "--with-parent"],  # it ends with this process
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
         )
         self._note = client.add_notification("One moment", "The page is being made.", loading=True)
 
@@ -51,3 +54,9 @@ class Export:
                 reason = self._process.stderr.read().decode(errors="replace")[-300:]
                 self._client.add_notification("There is no page", reason, color="red")
         return True
+
+    def cancel(self) -> None:
+        """End it at once."""
+        self._process.kill()
+        self._process.wait()
+        self._directory.cleanup()

@@ -19,8 +19,9 @@ from goalgan_bt.record import RunError, write_atomically
 from goalgan_bt.viz.body import Bodies
 from goalgan_bt.viz.curves import COLOURS, PLOTS, levels, series
 from goalgan_bt.viz.player import Player
-from goalgan_bt.viz.run import Frame, Run
-from goalgan_bt.viz.scene import LAYERS, Scene, legend, look_at, start_server
+from goalgan_bt.viz.run import Frame, Run, places
+from goalgan_bt.viz.scene import LAYERS, Scene, legend, look_at
+from goalgan_bt.viz.server import start_server
 from goalgan_bt.viz.words import caption, settings_rows, state
 
 MOST_REPORTS = 300
@@ -60,6 +61,8 @@ def export(run: Run, path: Path) -> None:
             reports.append({"time": time, "steps": _known(steps) or 0.0, "text": text})
             recording.insert_sleep(pause)
             time += pause
+        if not reports:
+            raise RunError(f"{run.folder} holds no report that can be read")
         for seconds, words in _last_policy(run, server, scene, recording):
             reports.append({"time": time, "steps": reports[-1]["steps"], "text": words})
             time += seconds
@@ -69,7 +72,7 @@ def export(run: Run, path: Path) -> None:
             server.stop()
     text = json.dumps(_beside(run) | {"reports": reports, "scene": html}, allow_nan=False)
     page = resources.files("goalgan_bt.viz").joinpath("export.html").read_text(encoding="utf-8")
-    page = page.replace("RUN</script>", text.replace("</", "<\\/") + "</script>", 1)
+    page = page.replace("RUN</script>", text.replace("<", "\\u003c") + "</script>", 1)
     write_atomically(path, lambda file: file.write(page.encode()))
 
 
@@ -95,9 +98,8 @@ def _last_policy(
             bodies.draw(states)
             recording.insert_sleep(every * attempt.dt)
             seconds += every * attempt.dt
-        what = "reached" if attempt.reached[0] else "not reached"
         x, y = goal[0, :2]
-        yield seconds, f"The last policy goes to ({x:.1f}, {y:.1f}): {what}"
+        yield seconds, f"The last policy goes to ({x:.1f}, {y:.1f}): {attempt.outcome(0)}"
 
 
 def _smaller(frame: Frame) -> Frame:
@@ -105,7 +107,7 @@ def _smaller(frame: Frame) -> Frame:
     small = dict(frame)
     for name, most in (("traces", TRACES), ("paths", PATHS)):
         if name in frame:
-            small[name] = frame[name][:, :most].round(2)
+            small[name] = places(frame, name, 3)[:, :most].round(2)
     return small
 
 

@@ -1,6 +1,5 @@
 """`metrics.csv` as it grows: after the first look only what is new is read."""
 
-import csv
 import math
 import os
 from array import array
@@ -21,9 +20,9 @@ class Metrics:
         changed: when it last changed, seconds since the epoch; minus infinity before it exists.
     """
 
-    _names: list[str]
     _columns: dict[str, "array[float]"]
-    _row_of: dict[int, int]  # of an iteration
+    _row_of: dict[int, int]  # the last one of an iteration
+    _header: bytes
     _read: int  # bytes
     _stamp: tuple[int, int, int]  # of the file: inode, size, time
 
@@ -33,7 +32,7 @@ class Metrics:
         self._forget()
 
     def __len__(self) -> int:
-        return len(self._row_of)
+        return len(self._columns.get("iteration", ()))
 
     def refresh(self) -> bool:
         """Read what is new; whether the file has changed."""
@@ -43,8 +42,11 @@ class Metrics:
                 stamp = status.st_ino, status.st_size, status.st_mtime_ns
                 if stamp == self._stamp:
                     return False
-                if stamp[0] != self._stamp[0] or stamp[1] < self._read:  # another file
+                header = file.readline()
+                same = stamp[0] == self._stamp[0] and header == self._header
+                if not same or status.st_size < self._read:  # another table
                     self._forget()
+                    self._header = header
                 self._stamp, self.changed = stamp, status.st_mtime
                 file.seek(self._read)
                 new = file.read()
@@ -52,12 +54,12 @@ class Metrics:
             return False
         whole = new[: new.rfind(b"\n") + 1]
         self._read += len(whole)
-        for cells in csv.reader(whole.decode(errors="replace").splitlines()):
-            if not self._names:
-                self._names = cells
+        for line in whole.decode(errors="replace").split("\n")[:-1]:
+            cells = line.rstrip("\r").split(",")  # numbers and names: nothing is quoted
+            if not self._columns:
                 self._columns = {name: array("d") for name in cells}
-            elif len(cells) == len(self._names):  # else: cut short and gone on with by a resume
-                row = dict(zip(self._names, map(_number, cells), strict=True))
+            elif len(cells) == len(self._columns):  # else: cut short and gone on with by a resume
+                row = dict(zip(self._columns, map(_number, cells), strict=True))
                 if math.isfinite(iteration := row.get("iteration", math.nan)):
                     self._row_of[int(iteration)] = len(self)
                     for name, value in row.items():
@@ -78,8 +80,8 @@ class Metrics:
         return math.nan if row is None or name not in self._columns else self._columns[name][row]
 
     def _forget(self) -> None:
-        self._names, self._columns, self._row_of = [], {}, {}
-        self._read, self._stamp = 0, (0, 0, 0)
+        self._columns, self._row_of = {}, {}
+        self._header, self._read, self._stamp = b"", 0, (0, 0, 0)
 
 
 def _number(text: str) -> float:

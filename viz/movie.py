@@ -1,6 +1,7 @@
 """The map of a run as it grows, as a GIF or MP4: `python -m goalgan_bt.viz RUN --movie out.gif`."""
 
 from pathlib import Path
+from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
@@ -22,29 +23,22 @@ def movie(folder: Path, path: Path) -> None:
 
     Args:
         folder: the run; it must have a maze.
-        path: a .gif or .mp4 file; MP4 needs the extra `movie`.
+        path: an .mp4 file, which needs the extra `movie`, or a .gif.
 
     Raises:
-        RunError: if the run has no maze or no report, or the file is of another kind.
+        RunError: if the run has no maze or no report.
         OSError: if the file cannot be written.
     """
-    if path.suffix not in (".gif", ".mp4"):
-        raise record.RunError(f"--movie makes a .gif or a .mp4 file, not {path.name}")
     frames = record.frames(folder)
     if not frames:
         raise record.RunError(f"{folder} holds no report yet: wait for its first one")
     picks = np.unique(np.linspace(0, len(frames) - 1, PICTURES).round().astype(int))
     images = [_picture(folder, frames[i]) for i in track(picks, "movie", transient=True)]
     images += [images[-1]] * HOLD
-    if path.suffix == ".gif":
-        data = iio.imwrite("<bytes>", images, extension=".gif", duration=1000 / PER_SECOND, loop=0)
-    else:
-        try:
-            data = iio.imwrite(
-                "<bytes>", images, extension=".mp4", plugin="pyav", codec="libx264", fps=PER_SECOND
-            )
-        except ImportError:
-            raise record.RunError('an MP4 needs PyAV: pip install "goalgan_bt[movie]"') from None
+    how: dict[str, Any] = {"duration": 1000 / PER_SECOND, "loop": 0}
+    if path.suffix.lower() == ".mp4":
+        how = {"plugin": "pyav", "codec": "libx264", "fps": PER_SECOND}
+    data = iio.imwrite("<bytes>", images, extension=path.suffix.lower(), **how)
     record.write_atomically(path, lambda file: file.write(data))
 
 

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from goalgan_bt import record
-from goalgan_bt.viz.published import PUBLISHED
-from goalgan_bt.viz.run import maze_of, success
+from goalgan_bt.viz.published import Published, published
+from goalgan_bt.viz.run import Run, labels, maze_of, places, success
 
 # Red (never reached) over pale yellow to blue (mastered): readable for colour-blind people.
 COLOURS = "RdYlBu"
@@ -30,21 +30,20 @@ def coverage_curve(ax: Axes, folders: list[Path], until: int | None = None) -> N
     Raises:
         RunError: if a folder is no run.
     """
-    names: dict[str, None] = {}  # in the order given
+    references: dict[Published, None] = {}  # in the order given
     for i, folder in enumerate(folders):
         _, rows = record.read_metrics(folder)
         rows = [row for row in rows if row.get("eval/coverage")]
         known = sum(until is None or int(row["iteration"]) <= until for row in rows)
-        steps = [float(row["steps/train"]) for row in rows]
+        steps = [float(row.get("steps/train") or "nan") for row in rows]
         coverage = [float(row["eval/coverage"]) for row in rows]
         coverage[known:] = [math.nan] * (len(rows) - known)
         ax.plot(steps, coverage, color=f"C{i}", label=folder.name, marker=".", markersize=4)
-        names[folder.name.split("-")[0]] = None
-    for name in names:
-        for line, grey in zip(PUBLISHED.get(name, ()), ("0.65", "0.35"), strict=False):
-            label = f"{line.method} (published)"
-            ax.plot(*zip(*line.points, strict=True), "o--", color=grey, markersize=3, label=label)
-            ax.set_xscale("log")
+        references |= dict.fromkeys(published(Run(folder).settings))
+    for line, grey in zip(references, ("0.65", "0.35") * 9, strict=False):
+        label = f"{line.method} (published)"
+        ax.plot(*zip(*line.points, strict=True), "o--", color=grey, markersize=3, label=label)
+        ax.set_xscale("log")
     ax.set(xlabel="environment steps of training", ylabel="coverage", ylim=(0, 1))
     ax.grid(alpha=0.25)
     ax.legend(fontsize=7, frameon=False, loc="upper left")
@@ -80,10 +79,10 @@ def coverage_map(ax: Axes, folder: Path, frame: Path, goals: float = 7.0) -> Any
         colour = image.to_rgba(value)
         ax.add_patch(Rectangle((x - side / 2, y - side / 2), side, side, color=colour, lw=0))
     if goals:
-        lines = np.swapaxes(arrays["traces"], 0, 1)
+        lines = np.swapaxes(places(arrays, "traces", 3)[..., :2], 0, 1)
         ax.add_collection(LineCollection(list(lines), colors="#111111", linewidths=0.5, alpha=0.5))
         for label, (text, shade) in LABELS.items():
-            x, y = arrays["goals"][arrays["label"] == label].T
+            x, y = arrays["goals"][labels(arrays) == label, :2].T
             ax.scatter(x, y, s=goals, color=shade, label=text, lw=0.3, edgecolors="white")
     ax.plot(0, 0, marker="*", color="white", markeredgecolor="#111111", markersize=9)
     ax.set(xlim=(maze.low[0], maze.high[0]), ylim=(maze.low[1], maze.high[1]), aspect="equal")

@@ -15,6 +15,7 @@ from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.policy import GaussianPolicy
 from goalgan_bt.record import RunError
 from goalgan_bt.train import make_env
+from goalgan_bt.viz.run import maze_of
 
 
 @dataclass(frozen=True)
@@ -22,14 +23,20 @@ class Attempt:
     """Episodes side by side.
 
     goals: (n, goal_dim); states: (T + 1, n, state_dim), each held still after its end;
-    ends: (n,) the action after which each ended; reached: (n,); dt: seconds between two states.
+    ends: (n,) the action after which each ended; reached: (n,); fell: (n,), or failed otherwise;
+    dt: seconds between two states.
     """
 
     goals: FloatArray
     states: FloatArray
     ends: np.ndarray
     reached: BoolArray
+    fell: BoolArray
     dt: float
+
+    def outcome(self, i: int) -> str:
+        """How an episode ended, in a word or two."""
+        return "reached" if self.reached[i] else "fell" if self.fell[i] else "not reached"
 
     @property
     def seconds(self) -> float:
@@ -54,10 +61,10 @@ class Player:
     def __init__(self, folder: Path, seed: int = 0) -> None:
         torch.set_num_threads(1)  # the trainer needs the cores
         self._folder = folder
-        cfg = replace(config.load(folder), threads=1)
-        self.env = make_env(cfg, len(make_env(cfg, 1).test_goals()))
+        cfg, maze = replace(config.load(folder), threads=1), maze_of(folder)
+        self.env = make_env(cfg, len(make_env(cfg, 1, maze).test_goals()), maze)
         self._policy = GaussianPolicy(self.env.obs_dim, self.env.act_dim, cfg.policy)
-        self._stamp: int | None = None
+        self._tried: int | None = None  # the checkpoint last looked at, by its time
         self.iteration = 0
         self.rng = np.random.default_rng(seed)
 
@@ -71,12 +78,12 @@ class Player:
         path = self._folder / "checkpoint.pt"
         try:
             stamp = os.stat(path).st_mtime_ns
-            if stamp != self._stamp:
+            if stamp != self._tried:
+                self._tried = stamp
                 self.iteration = checkpoint.load_policy(self._policy, self._folder)
-                self._stamp = stamp
         except (OSError, RunError):
             pass  # none yet, or another version: the last one will do
-        return self._stamp is not None
+        return self.iteration > 0
 
     def attempt(self, goals: FloatArray, deterministic: bool = False) -> Attempt:
         """Try each goal once from the start.
@@ -89,13 +96,15 @@ class Player:
         seed = int(self.rng.integers(2**31))
         noise = None if deterministic else torch.Generator().manual_seed(seed)
         states = [np.tile(env.start_state, (n, 1))]
-        reached, ends = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
+        reached, fell = np.zeros((2, n), dtype=bool)
+        ends = np.zeros(n, dtype=np.int64)
         for active, step in attempts(env, self._policy, goals, noise):
             states.append(states[-1].copy())
             states[-1][active] = step.states
             ends[active] = len(states) - 1
             reached[active] = step.rewards > 0
-        return Attempt(goals, np.array(states), ends, reached, env.dt * env.action_repeat)
+            fell[active] = step.terminated & (step.rewards == 0)
+        return Attempt(goals, np.array(states), ends, reached, fell, env.dt * env.action_repeat)
 
     def some_goal(self) -> FloatArray:
         """A feasible goal at random, (1, goal_dim)."""

@@ -1,6 +1,6 @@
 """Coverage that was published before, to be drawn beside ours."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 
 class Published(NamedTuple):
@@ -26,3 +26,8 @@ PUBLISHED = {
         Published("recall traces", ((0.5e6, 0.30), (3e6, 0.78), (4e6, 0.96))),
     ),
 }
+
+
+def published(settings: dict[str, Any]) -> tuple[Published, ...]:
+    """What was published for the task of these settings; with a map of one's own it is another."""
+    return PUBLISHED.get(str(settings.get("env")), ()) if settings.get("map") is None else ()

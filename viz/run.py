@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from goalgan_bt import record
-from goalgan_bt.envs.maze import FloatArray, MapError, Maze
+from goalgan_bt.envs.maze import FloatArray, Maze
 from goalgan_bt.viz.metrics import Metrics
 
 Frame = dict[str, NDArray[Any]]
@@ -29,8 +29,13 @@ def maze_of(folder: Path) -> Maze | None:
     """
     try:
         maze = record.read_meta(folder)["maze"]
-        return None if maze is None else Maze(tuple(maze["rows"]), maze["cell_size"])
-    except (KeyError, TypeError, MapError) as error:
+        if maze is None:
+            return None
+        side = float(maze["cell_size"])
+        if not 0 < side < 1e3:
+            raise ValueError(f"cells of {side} m")
+        return Maze(tuple(maze["rows"]), side)
+    except (KeyError, TypeError, ValueError) as error:
         raise record.RunError(f"{folder / 'meta.json'} is damaged: {error!r}") from None
 
 
@@ -52,12 +57,12 @@ class Run:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.name = folder, folder.name
+        self.folder, self.name = folder, folder.resolve().name
         self.maze = maze_of(folder)
         try:
             settings = json.loads((folder / "config.json").read_text())
             self.env, self.settings = str(settings["env"]), dict(settings)
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
             raise record.RunError(f"{folder} is no run: it has no readable config.json") from None
         self.iterations: list[int] = []
         self.metrics = Metrics(folder / "metrics.csv")
@@ -116,4 +121,25 @@ def success(frame: Frame) -> tuple[FloatArray, bool]:
     measured = np.asarray(frame["coverage"], dtype=float)
     if len(measured) and np.isfinite(measured).all():
         return measured, True
-    return np.asarray(frame.get("estimate", measured), dtype=float), False
+    return of_goals(frame, "estimate", measured), False
+
+
+def labels(frame: Frame) -> NDArray[np.int64]:
+    """-1, 0 or 1 per goal, (n,): too hard, intermediate (or not known), too easy."""
+    label = of_goals(frame, "label", np.zeros(len(frame["goals"])))
+    return np.clip(np.nan_to_num(label), -1, 1).astype(np.int64)
+
+
+def of_goals(frame: Frame, name: str, default: FloatArray) -> FloatArray:
+    """An array with a number per goal, (n,), or the default where a frame has none that fits."""
+    array = frame.get(name)
+    fits = array is not None and array.shape == default.shape and array.dtype.kind in "fiub"
+    return np.asarray(array if fits else default, dtype=float)
+
+
+def places(frame: Frame, name: str, dims: int) -> FloatArray:
+    """An array of places, (..., goal_dim), or none where a frame has none with so many axes."""
+    array = frame.get(name)
+    if array is None or array.ndim != dims or array.dtype.kind != "f" or array.shape[-1] < 2:
+        return np.empty((0,) * (dims - 1) + (2,))
+    return array

@@ -3,8 +3,6 @@
 Each layer is one node that is replaced in place; a frame of a run fills them all.
 """
 
-import contextlib
-import io
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,7 +10,7 @@ import viser
 from numpy.typing import NDArray
 
 from goalgan_bt.envs.maze import FloatArray, Maze
-from goalgan_bt.viz.run import Frame, success
+from goalgan_bt.viz.run import Frame, labels, of_goals, places, success
 
 # Red (never reached) over pale yellow to blue (mastered): ColorBrewer's RdYlBu, made to be told
 # apart by colour-blind people.
@@ -168,17 +166,16 @@ class Scene:
 
     def draw(self, frame: Frame) -> None:
         """Fill all layers from a frame; what a frame of an older version lacks stays empty."""
-        none = np.empty((0, 2))
         rate, _ = success(frame)
         self._draw_coverage(frame["test_goals"], rate)
         self._draw_goals(frame)
-        self._points("replay", frame.get("replay", none), REPLAYED, 0.012, 0.03)
-        empty = np.empty((0, 0, 2))
-        points, step = segments(frame.get("traces", empty))
-        fade = (1 - step / max(1, len(frame.get("traces", empty)) - 2))[:, None]
+        self._points("replay", places(frame, "replay", 2), REPLAYED, 0.012, 0.03)
+        traces = places(frame, "traces", 3)
+        points, step = segments(traces)
+        fade = (1 - step / max(1, len(traces) - 2))[:, None]
         shade = (OLD_TRACE + np.subtract(TRACE, OLD_TRACE) * fade).astype(np.uint8)
         self._lines("traces", points, np.repeat(shade[:, None], 2, axis=1), 2.5)
-        points, _ = segments(frame.get("paths", empty))
+        points, _ = segments(places(frame, "paths", 3))
         self._lines("paths", points, PATH, 1.0)
 
     def mark(self, goals: FloatArray, radius: float) -> None:
@@ -237,10 +234,8 @@ class Scene:
 
     def _draw_goals(self, frame: Frame) -> None:
         goals = frame["goals"]
-        label = frame.get("label", np.zeros(len(goals)))
-        palette = np.array([TOO_HARD, INTERMEDIATE, TOO_EASY], dtype=np.uint8)
-        shade = palette[np.clip(label, -1, 1).astype(int) + 1]
-        old = np.asarray(frame.get("replayed", np.zeros(len(goals))), dtype=bool)
+        shade = np.array([TOO_HARD, INTERMEDIATE, TOO_EASY], dtype=np.uint8)[labels(frame) + 1]
+        old = of_goals(frame, "replayed", np.zeros(len(goals))) > 0
         for node, rows, size in (("new", ~old, 0.09), ("old", old, 0.05)):
             # A dark rim, so that white goals are seen on a pale floor.
             # They float: a disc that faces the camera would stick in the floor.
@@ -286,12 +281,6 @@ class Scene:
             thickness=width,
             thickness_units="screen",
         )
-
-
-def start_server(host: str, port: int) -> viser.ViserServer:
-    """A viser server, without its banner; a busy port is replaced by a free one."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        return viser.ViserServer(host=host, port=port, label="goalgan_bt")
 
 
 def look_at(

@@ -13,18 +13,20 @@ from typing import Any
 import numpy as np
 import viser
 
-from goalgan_bt.config import ConfigError
 from goalgan_bt.envs.maze import FloatArray
+from goalgan_bt.progress import complain
 from goalgan_bt.viz.body import Bodies
 from goalgan_bt.viz.curves import Curves
 from goalgan_bt.viz.download import Export, as_csv
 from goalgan_bt.viz.player import Attempt, Player
 from goalgan_bt.viz.run import Frame, Run
-from goalgan_bt.viz.scene import LAYERS, Scene, drawn, legend, look_at, start_server
-from goalgan_bt.viz.words import caption, settings_table, state
+from goalgan_bt.viz.scene import LAYERS, Scene, drawn, legend, look_at
+from goalgan_bt.viz.server import start_server
+from goalgan_bt.viz.words import caption, plain, settings_table, state
 
 LOOK_EVERY = 1.0  # seconds between two looks at the run folders
 TICK = 1 / 25  # seconds between two pictures of the body
+RETRY = 10.0  # seconds after which a run that cannot be played is looked at again
 PAUSE = 1.0  # seconds for which a finished attempt stands still
 GAP = 1.15  # distance of two mazes side by side, in sides of one
 
@@ -56,8 +58,10 @@ class View:
         self._bodies: Bodies | None = None
         self._attempt: Attempt | None = None
         self._attempt_began = 0.0
+        self._next_try = 0.0  # when to look for a policy again
         self._asked = False  # whether the attempt is one that somebody asked for
         self._last_look = 0.0
+        self._trouble: list[str] = []
         self._export: Export | None = None  # one at a time, whoever asks
         self._place_camera()
         self._build_panel()
@@ -68,9 +72,8 @@ class View:
     def address(self) -> str:
         """Where the page is."""
         host = self.server.get_host()
-        return (
-            f"http://{'localhost' if host in ('0.0.0.0', '::') else host}:{self.server.get_port()}"
-        )
+        host = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+        return f"http://{host}:{self.server.get_port()}"
 
     # The loop.
 
@@ -83,55 +86,73 @@ class View:
             time.sleep(max(0.0, TICK - (time.monotonic() - begin)))
 
     def tick(self, now: float) -> None:
-        """Do what is due at that time (of `time.monotonic`)."""
-        while not self._requests.empty():
-            # A browser may send any value for any control: nonsense is dropped.
-            with contextlib.suppress(TypeError, ValueError, OverflowError):
-                self._serve(*self._requests.get())
-        if now - self._last_look >= LOOK_EVERY:
-            self._look()
-            self._last_look = now
-        if self._export is not None and self._export.done():
-            self._export = None
-        self._play_time(now)
+        """Do what is due at that time (of `time.monotonic`).
+
+        A page outlives whatever stands in a folder or comes from a browser: what goes wrong is told
+        once, if it happens more than once (viser's threads get in each other's way at times).
+        """
+        tasks = [self._serve_all, self._look_again, self._play_time]
         if self.server.get_clients():  # otherwise nobody looks
-            self._play_body(now)
+            tasks.append(self._play_body)
+        for task in tasks:
+            try:
+                task(now)
+            except Exception as error:
+                self._trouble.append(f"{type(error).__name__}: {error}")
+                if self._trouble.count(self._trouble[-1]) == 2:
+                    complain(f"the page leaves something out: {self._trouble[-1]}")
+                del self._trouble[:-100]
 
     def close(self) -> None:
         """Stop the server."""
+        if self._export is not None:
+            self._export.cancel()
         self.server.stop()
 
     # Time: which report is on show.
+
+    def _look_again(self, now: float) -> None:
+        if now - self._last_look >= LOOK_EVERY:
+            self._last_look = now
+            self._look()
+        if self._export is not None and self._export.done():
+            self._export = None
 
     def _look(self, first: bool = False) -> None:
         """Look for news in the folders, and show them."""
         news = [run.refresh() for run in self.runs]
         if any(news) or first:
-            last = max(0, len(self.runs[0].iterations) - 1)
+            last = max(0, len(self._longest.iterations) - 1)
             self._slider.max = max(1, last)
             self._slider.disabled = last == 0
             if self._follow.value and self._slider.value != last:
                 self._slider.value = last
             self._curves.refresh()
         if self._follow.value or self._shown is None:
-            self._show(len(self.runs[0].iterations) - 1)
+            self._show(len(self._longest.iterations) - 1)
         self._status.content = self._describe()
 
+    @property
+    def _longest(self) -> Run:
+        """The run whose reports the slider counts."""
+        return max(self.runs, key=lambda run: len(run.iterations))
+
     def _show(self, index: int) -> None:
-        """Draw the report with that index (of the first run) and what the others had by then."""
-        run = self.runs[0]
+        """Draw that report, of the run with most of them, and what the others had by then."""
+        run = self._longest
         if not run.iterations:
             return
-        index = int(np.clip(index, 0, len(run.iterations) - 1))
-        steps = run.metrics.at(run.iterations[index], "steps/train")
+        last = len(run.iterations) - 1
+        index = int(np.clip(index, 0, last))
+        steps = run.metrics.at(run.iterations[index], "steps/train") if index < last else np.inf
         with self.server.atomic():
             for i, (other, scene) in enumerate(zip(self.runs, self._scenes, strict=True)):
-                frame = other.frame(run.iterations[index] if i == 0 else report_at(other, steps))
+                frame = other.frame(
+                    run.iterations[index] if other is run else report_at(other, steps)
+                )
                 if frame is None or frame is self._drawn[i]:
                     continue
-                # A frame of another version, or damaged: what it lacks keeps the last picture.
-                with contextlib.suppress(KeyError, ValueError, IndexError, TypeError):
-                    scene.draw(frame)
+                scene.draw(frame)
                 self._drawn[i] = frame
         self._shown = index
         self._caption.content = caption(run, run.iterations[index])
@@ -145,7 +166,7 @@ class View:
             return
         self._playing_since = now
         here = 0 if self._shown is None else self._shown + 1
-        self._slider.value = here if here < len(self.runs[0].iterations) else 0
+        self._slider.value = here if here < len(self._longest.iterations) else 0
         self._show(self._slider.value)
 
     # The body, and the goals that people set.
@@ -168,9 +189,12 @@ class View:
     def _ready(self) -> bool:
         """Whether there is a policy to play; takes up the newest."""
         if self._player is None:
+            if time.monotonic() < self._next_try:
+                return False
             try:
                 self._player = Player(self.runs[0].folder)
-            except (ConfigError, OSError, ValueError):
+            except Exception:  # the settings are another version's, or nonsense
+                self._next_try = time.monotonic() + RETRY
                 return False
         return self._player.take_newest()
 
@@ -178,9 +202,23 @@ class View:
         assert self._player is not None
         if self._bodies is None:
             self._bodies = Bodies(self.server, self._player.model, "/run0/body/points")
+            self._bodies.show(self._scenes[0].visible("body"))
         self._attempt = self._player.attempt(goals)
         self._attempt_began = time.monotonic()
         self._scenes[0].mark(goals, self._player.env.success_radius)
+
+    def _serve_all(self, now: float) -> None:
+        attempt = None
+        while not self._requests.empty():
+            request = self._requests.get()
+            if request[0] in ("goal", "all"):
+                attempt = request  # one at a time: the last one counts
+            else:
+                # A browser may send any value for any control: nonsense is dropped.
+                with contextlib.suppress(TypeError, ValueError, OverflowError):
+                    self._serve(*request)
+        if attempt is not None:
+            self._serve(*attempt)
 
     def _serve(self, request: str, value: Any) -> None:
         if request == "slider":
@@ -304,19 +342,18 @@ class View:
     # Words.
 
     def _describe(self) -> str:
-        return "\n\n".join(f"**{run.name}** {state(run)}" for run in self.runs)
+        return "\n\n".join(f"**{plain(run.name)}** {plain(state(run))}" for run in self.runs)
 
     def _describe_attempt(self, now: float) -> str:
         attempt = self._attempt
         assert attempt is not None and self._player is not None
-        done = now - self._attempt_began
+        done = max(0.0, now - self._attempt_began)
         whose = f"Policy of iteration {self._player.iteration:,}. "
         if len(attempt.goals) == 1:
             x, y = attempt.goals[0, :2]
             if done < attempt.seconds:
                 return f"{whose}Goal ({x:.1f}, {y:.1f}): on its way, {done:.1f} s"
-            early = attempt.ends[0] * attempt.dt < self._player.env.horizon * self._player.env.dt
-            why = "reached" if attempt.reached[0] else "fell" if early else "not reached"
+            why = attempt.outcome(0)
             return f"{whose}Goal ({x:.1f}, {y:.1f}): **{why}** after {attempt.seconds:.1f} s"
         ended = attempt.ends * attempt.dt <= done
         reached = int((attempt.reached & ended).sum())

@@ -10,6 +10,15 @@ from goalgan_bt.viz.run import Run, success
 SILENT = 120.0  # seconds without news after which a run counts as stopped
 
 
+def plain(text: str) -> str:
+    """A text from a run folder as markdown that shows just that text.
+
+    The page's markdown takes HTML and reads images from the server's disk: nothing of the sort may
+    come from a folder.
+    """
+    return "".join(x if x.isalnum() or x in " .,-:()" else f"&#{ord(x)};" for x in text)
+
+
 def state(run: Run) -> str:
     """What goes on in a run, in a few words."""
     if run.gone:
@@ -56,6 +65,5 @@ def settings_rows(settings: dict[str, Any], prefix: str = "") -> list[tuple[str,
 
 def settings_table(settings: dict[str, Any]) -> str:
     """Settings as a markdown table."""
-    safe = str.maketrans({"|": "/", "<": "&lt;", "`": "'"})
-    rows = [f"| {name} | {text.translate(safe)} |" for name, text in settings_rows(settings)]
+    rows = [f"| {plain(name)} | {plain(text)} |" for name, text in settings_rows(settings)]
     return "\n".join(["| setting | value |", "|---|---|", *rows])
