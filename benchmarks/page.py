@@ -70,9 +70,10 @@ def serve(folder: Path, visitors: int) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         text=True,
     )
-    assert page.stdout is not None
+    assert page.stdout is not None and page.stdin is not None
     port = int(page.stdout.readline().strip().rsplit(":", 1)[1])
     if os.fork() == 0:
+        page.stdin.close()  # or else the page would never see its end
         os.nice(19)  # they would use another machine's cores
         threads = [threading.Thread(target=visitor, args=(port,)) for _ in range(visitors)]
         for thread in threads:
@@ -125,7 +126,7 @@ def memory(cfg: PageConfig, out: Path) -> list[float]:
         frame["coverage"] = np.random.default_rng(i).random(len(frame["coverage"]))
         records.frame(i + 3, **frame)
         time.sleep(cfg.pause)
-        if (i + 1) % (cfg.reports // 10) == 0:
+        if (i + 1) % max(1, cfg.reports // 10) == 0:
             status = Path(f"/proc/{page.pid}/status").read_text()
             kib = next(line for line in status.splitlines() if line.startswith("VmRSS")).split()[1]
             sizes.append(round(int(kib) / 1024, 1))

@@ -33,6 +33,7 @@ class Learner:
     def __init__(self, env: GoalEnv, cfg: Config) -> None:
         torch.manual_seed(cfg.seed)  # first weights
         self.cfg = cfg.goals
+        self._reach = max(env.success_radius, cfg.goals.near)  # metres
         self.iteration = 0
         self.steps = {"train": 0, "label": 0, "eval": 0}
         self.seconds = 0.0
@@ -68,15 +69,14 @@ class Learner:
         Besides the bounds on success, a goal must be near a place where the agent has been: the
         estimator averages over neighbours, and beside a mastered place there may be a wall.
         """
-        return intermediate(success, self.cfg.r_min, self.cfg.r_max) & self._near(goals)
+        near = self.visited.distance_to(goals) <= self.cfg.near
+        return intermediate(success, self.cfg.r_min, self.cfg.r_max) & near
 
     def estimated_success(self, goals: FloatArray) -> FloatArray:
-        """What a map shows: success at goals (n, goal_dim) as estimated, (n,), and 0 far from any
-        place where the agent has been."""
-        return np.where(self._near(goals), self.estimator(goals), 0.0)
-
-    def _near(self, goals: FloatArray) -> BoolArray:
-        return self.visited.distance_to(goals) <= self.cfg.near
+        """What a map shows: success at goals (n, goal_dim) as estimated, (n,), and 0 where the agent
+        has never been so near that it would have reached them."""
+        reached = self.visited.distance_to(goals) <= self._reach
+        return np.where(reached, self.estimator(goals), 0.0)
 
     def _modules(self) -> dict[str, Any]:
         """Everything with torch's `state_dict` and `load_state_dict`: networks, optimisers."""

@@ -7,6 +7,7 @@ runs/<env>-<time>-s<seed>/
     frames/000010.npz a report: goals, labels, replay, traces, coverage (see `Record.frame`)
     checkpoint.pt     the whole training state (see `goalgan_bt.checkpoint`)
     ended.txt         how the run ended; absent while it goes on, or where it was killed
+    lock              held by the process that trains
     events.*          TensorBoard, if it is installed (extra `tensorboard`)
 """
 

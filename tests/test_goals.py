@@ -96,4 +96,4 @@ def test_only_goals_near_visited_places_are_intermediate():
     labels = learner.intermediate(goals, np.array([0.5, 0.5, 1.0]))
     assert labels.tolist() == [True, False, False]
     learner.estimator.add(goals.repeat(5, axis=0), np.ones(15, dtype=bool))
-    assert learner.estimated_success(goals).tolist() == [1.0, 0.0, 1.0]
+    assert learner.estimated_success(np.array([[0.9, 0.0], [1.1, 0.0]])).tolist() == [1.0, 0.0]

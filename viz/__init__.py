@@ -1,1 +1,1 @@
-"""Pictures of runs: read run folders, know nothing of the learner."""
+"""What people look at: reads run folders only, and never the process that trains."""
