@@ -73,7 +73,7 @@ class Learner:
         return intermediate(success, self.cfg.r_min, self.cfg.r_max) & near
 
     def estimated_success(self, goals: FloatArray) -> FloatArray:
-        """What a map shows: success at goals (n, goal_dim) as estimated, (n,), but 0 where the agent
+        """What a map shows: estimated success at goals (n, goal_dim), (n,), but 0 where the agent
         has never been near enough to reach them."""
         reached = self.visited.distance_to(goals) <= self._reach
         return np.where(reached, self.estimator(goals), 0.0)
