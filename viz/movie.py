@@ -7,6 +7,7 @@ import imageio.v3 as iio
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 from rich.progress import track
 
@@ -44,7 +45,8 @@ def movie(folder: Path, path: Path) -> None:
 
 def _picture(folder: Path, frame: Path) -> NDArray[np.uint8]:
     """One report, (height, width, 3)."""
-    figure = Figure(figsize=(9, 4), dpi=90, layout="constrained")  # MP4 wants even sides
+    layout = ConstrainedLayoutEngine(rect=(0, 0, 1, 0.97))  # room for the map's title
+    figure = Figure(figsize=(9, 4), dpi=90, layout=layout)  # MP4 wants even sides
     canvas = FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, width_ratios=[1, 1.2])
     image = pictures.coverage_map(left, folder, frame, goals=16)
