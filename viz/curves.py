@@ -105,12 +105,11 @@ class Curves:
         self._handles: list[Any] = []
         if len(runs) > 1:
             names = [run.name for run in runs]
-            self._handles.append(_add(gui, "Coverage", self._compared(), names))
+            self._handles.append(_add(gui, PLOTS[0], self._compared(), names, runs[0]))
         else:
             for plot in PLOTS:
                 names = [name for _, name in plot.curves]
-                extra = [name for name, _ in levels(runs[0], plot)]
-                self._handles.append(_add(gui, plot.title, self._data(plot), names, extra))
+                self._handles.append(_add(gui, plot, self._data(plot), names, runs[0]))
 
     def refresh(self) -> None:
         """Send what is new to the page."""
@@ -122,34 +121,38 @@ class Curves:
 
     def _data(self, plot: Plot) -> tuple[FloatArray, ...]:
         data = series(self._runs[0], plot)
-        return data + tuple(np.full(len(data[0]), y) for _, y in levels(self._runs[0], plot))
+        return (*data, *self._levels(plot, len(data[0])))
+
+    def _levels(self, plot: Plot, n: int) -> list[FloatArray]:
+        return [np.full(n, y) for _, y in levels(self._runs[0], plot)]
 
     def _compared(self) -> tuple[FloatArray, ...]:
         own = [series(run, PLOTS[0])[:2] for run in self._runs]
         longest = max((steps for steps, _ in own), key=lambda steps: steps[-1])
-        return (longest, *(np.interp(longest, x, y, right=np.nan) for x, y in own))
+        curves = (np.interp(longest, x, y, right=np.nan) for x, y in own)
+        return (longest, *curves, *self._levels(PLOTS[0], len(longest)))
 
 
 def _add(
-    gui: viser.GuiApi,
-    title: str,
-    data: tuple[FloatArray, ...],
-    names: list[str],
-    references: list[str] | None = None,
+    gui: viser.GuiApi, plot: Plot, data: tuple[FloatArray, ...], names: list[str], run: Run
 ) -> viser.GuiUplotHandle:
+    """A plot with the curves of those names and the levels published for a run's task."""
     lines = [
         uplot.Series(label=name, stroke=COLOURS[i % len(COLOURS)], width=2, spanGaps=True)
         for i, name in enumerate(names)
     ]
     lines += [
         uplot.Series(label=name, stroke="#999999", width=1, dash=(4, 4 + 4 * i))
-        for i, name in enumerate(references or [])
+        for i, (name, _) in enumerate(levels(run, plot))
     ]
+    scales = {"x": uplot.Scale(time=False)}
+    if plot.share:
+        scales["y"] = uplot.Scale(range=(0.0, 1.0))
     return gui.add_uplot(
         data,
         (uplot.Series(label="million steps"), *lines),
-        title=title,
-        scales={"x": uplot.Scale(time=False)},
+        title=plot.title,
+        scales=scales,
         axes=(uplot.Axis(stroke="#888888"), uplot.Axis(stroke="#888888", size=45)),
         legend=uplot.Legend(show=True),
         aspect=1.6,
