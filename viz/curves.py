@@ -147,7 +147,7 @@ def _add(
     ]
     scales = {"x": uplot.Scale(time=False)}
     if plot.share:
-        scales["y"] = uplot.Scale(range=(0.0, 1.0))
+        scales["y"] = uplot.Scale(range=(0.0, 1.05))
     return gui.add_uplot(
         data,
         (uplot.Series(label="million steps"), *lines),
