@@ -462,7 +462,7 @@ def test_many_wishes_are_one_attempt(view, monkeypatch):
     ("arguments", "message"),
     [
         ([], "python -m goalgan_bt.viz RUN"),
-        (["nowhere"], "nowhere is no run"),
+        (["nowhere"], "error: nowhere is no run"),
         (["nowhere", "--port", "99999"], "--port must be between 0 and 65535"),
         (["nowhere", "--frobnicate"], "--help"),
     ],

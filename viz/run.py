@@ -27,8 +27,9 @@ def maze_of(folder: Path) -> Maze | None:
     Raises:
         RunError: if the folder is no run.
     """
+    meta = record.read_meta(folder)
     try:
-        maze = record.read_meta(folder)["maze"]
+        maze = meta["maze"]
         if maze is None:
             return None
         side = float(maze["cell_size"])
