@@ -7,6 +7,7 @@ reached their goal, and unrolled backward from a state: s_t = s_{t+1} + ds_t. Th
 body's physical state (positions and velocities), without the goal: physics does not know it.
 """
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,9 +18,12 @@ from torch import Tensor, nn
 
 from goalgan_bt.envs.batch import GoalEnv
 from goalgan_bt.envs.maze import BoolArray, FloatArray
-from goalgan_bt.policy import mlp
+from goalgan_bt.mlp import MLP, RELU, TANH, Linearised
 
 Float32 = NDArray[np.float32]
+
+
+LOG_VAR = (-10.0, 2.0)  # bounds of the learned log variance, normalised units
 
 
 @dataclass(frozen=True)
@@ -153,8 +157,8 @@ class BacktrackingModel(nn.Module):
     ) -> None:
         super().__init__()
         self.cfg, self._rng = cfg, generator
-        self.action_net = mlp((state_dim, *cfg.hidden, act_dim), nn.Tanh)
-        self.state_net = mlp((state_dim + act_dim, *cfg.hidden, 2 * state_dim), nn.ReLU)
+        self.action_net = MLP((state_dim, *cfg.hidden, act_dim), TANH)
+        self.state_net = MLP((state_dim + act_dim, *cfg.hidden, 2 * state_dim), RELU)
         self.state_scale, self.delta_scale = Scale(state_dim), Scale(state_dim)
         self.action_scale = Scale(act_dim)
         params = [*self.action_net.parameters(), *self.state_net.parameters()]
@@ -184,35 +188,38 @@ class BacktrackingModel(nn.Module):
         losses = np.zeros((steps, 2))
         batches = (x.split(self.cfg.batch) for x in (following, actions, deltas))
         for i, batch in enumerate(zip(*batches, strict=True)):
-            action_nll, state_nll = self.negative_log_likelihood(*batch)
-            loss = action_nll + state_nll
-            self.optimiser.zero_grad(set_to_none=True)
-            loss.backward()
+            losses[i] = self.negative_log_likelihood(*batch)
             nn.utils.clip_grad_norm_(self.parameters(), 1.0)
             self.optimiser.step()
-            losses[i] = action_nll.item(), state_nll.item()
         action_nll, state_nll = losses.mean(axis=0)
         return {"action_nll": action_nll, "state_nll": state_nll}
 
+    @torch.no_grad()
     def negative_log_likelihood(
         self, next_states: Tensor, actions: Tensor, deltas: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """-log q(a | s') and -log q(ds | a, s'), means over the batch and the dimensions.
+    ) -> tuple[float, float]:
+        """-log q(a | s') and -log q(ds | a, s'), means over the batch and the dimensions; leaves
+        the gradients of their sum in the two networks.
 
         Args:
             next_states: (n, state_dim); actions: (n, act_dim); deltas: (n, state_dim).
         """
         s, a = self.state_scale.normalise(next_states), self.action_scale.normalise(actions)
-        constant = 0.5 * np.log(2 * np.pi)
-        action_nll = 0.5 * (a - self.action_net(s)).square().mean() + constant
-        mean, log_var = self._delta(s, a)
-        error = self.delta_scale.normalise(deltas) - mean
-        state_nll = 0.5 * (error.square() * torch.exp(-log_var) + log_var).mean() + constant
-        return action_nll, state_nll
+        constant = 0.5 * math.log(2 * math.pi)
+        acted = Linearised(self.action_net, s)
+        miss = acted.output - a
+        self.action_net.flat.grad = acted.vjp(miss / miss.numel())
 
-    def _delta(self, s: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-        mean, log_var = self.state_net(torch.cat([s, a], dim=-1)).chunk(2, dim=-1)
-        return mean, log_var.clamp(-10.0, 2.0)
+        moved = Linearised(self.state_net, torch.cat([s, a], dim=-1))
+        mean, log_var = moved.output.chunk(2, dim=-1)
+        bounded = log_var.clamp(*LOG_VAR)
+        error, precision = mean - self.delta_scale.normalise(deltas), torch.exp(-bounded)
+        chi = error.square() * precision
+        of_log_var = 0.5 * (1 - chi) * (bounded == log_var)
+        u = torch.cat([error * precision, of_log_var], dim=-1) / error.numel()
+        self.state_net.flat.grad = moved.vjp(u)
+        action_nll = 0.5 * miss.square().mean().item() + constant
+        return action_nll, 0.5 * (chi + bounded).mean().item() + constant
 
     @torch.no_grad()
     def predecessors(self, next_states: Tensor) -> tuple[Tensor, Tensor]:
@@ -222,7 +229,9 @@ class BacktrackingModel(nn.Module):
         if self.cfg.sample_actions:
             a = a + torch.randn(a.shape, generator=self._rng)
         actions = self.action_scale.restore(a).clamp(-1.0, 1.0)  # the body feels no more
-        mean, log_var = self._delta(s, self.action_scale.normalise(actions))
+        a = self.action_scale.normalise(actions)
+        mean, log_var = self.state_net(torch.cat([s, a], dim=-1)).chunk(2, dim=-1)
+        log_var = log_var.clamp(*LOG_VAR)
         noise = torch.randn(mean.shape, generator=self._rng)
         delta = self.delta_scale.restore(mean + torch.exp(0.5 * log_var) * noise)
         return next_states + delta, actions

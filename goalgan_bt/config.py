@@ -102,9 +102,10 @@ ANT = Config(
     action_repeat=2,
     discount=0.993,
     updates=4,
-    policy=PolicyConfig(init_std=0.2, final_std=0.07),
+    policy=PolicyConfig(hidden=(64, 64), init_std=0.2, final_std=0.07),
+    value=ValueConfig(hidden=(64, 64)),
     rollout=RolloutConfig(num_envs=256, steps=50),
-    gan=GanConfig(steps=100),
+    gan=GanConfig(batch=128, steps=100),
     backtracking=BacktrackingConfig(trace_length=50),
     imitation=ImitationConfig(steps=5, learning_rate=1e-5, max_kl=0.0005),
 )

@@ -12,9 +12,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from goalgan_bt import ranks
 from goalgan_bt.envs.batch import GoalEnv, Ids, Step
 from goalgan_bt.envs.maze import FloatArray
-from goalgan_bt.policy import GaussianPolicy
+from goalgan_bt.policy import Actor, GaussianPolicy
 
 
 @dataclass(frozen=True)
@@ -48,11 +49,14 @@ def attempts(
     Yields:
         After each action the goals, as indices, whose episodes it moved on, and what it gave.
     """
-    active = np.arange(len(goals))
+    active, act = np.arange(len(goals)), Actor(policy)
     env.reset(active, goals)
     obs = env.observe(active)
     while len(active):
-        step = env.step(active, policy.act(obs, noise))
+        drawn = None
+        if noise is not None:
+            drawn = torch.randn(len(active), env.act_dim, generator=noise)
+        step = env.step(active, act(obs, drawn))
         yield active, step
         going = ~(step.terminated | step.truncated)
         active, obs = active[going], step.obs[going]
@@ -65,7 +69,7 @@ def success_rate(
     rollouts: int,
     noise: torch.Generator | None,
 ) -> Success:
-    """Try each goal from the start.
+    """Try each goal from the start; several ranks share the work.
 
     Args:
         env: simulations for this purpose; as many goals at a time as it has.
@@ -74,11 +78,12 @@ def success_rate(
         rollouts: episodes per goal.
         noise: draws actions; None for the deterministic policy.
     """
-    tried = np.repeat(goals, rollouts, axis=0)
+    tried = np.repeat(goals, rollouts, axis=0)[ranks.share(len(goals) * rollouts)]
     reached = np.zeros(len(tried))
     steps = 0
     for begin in range(0, len(tried), env.num_envs):
         for active, step in attempts(env, policy, tried[begin : begin + env.num_envs], noise):
             steps += len(active) * env.action_repeat
             reached[begin + active] = step.rewards
-    return Success(reached.reshape(len(goals), rollouts).mean(axis=1), steps)
+    rate = ranks.gather(reached).reshape(len(goals), rollouts).mean(axis=1)
+    return Success(rate, int(ranks.total(torch.tensor(steps))))

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from goalgan_bt.envs.maze import BoolArray, FloatArray
-from goalgan_bt.policy import mlp
+from goalgan_bt.mlp import LEAKY_RELU, MLP, RELU, Linearised
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ class GoalGAN:
     ) -> None:
         self.low, self.high, self.cfg, self._rng = low, high, cfg, generator
         dim = len(low)
-        self.generator = mlp((cfg.noise_dim, *cfg.generator_hidden, dim), nn.ReLU)
-        self.discriminator = mlp((dim, *cfg.discriminator_hidden, 1), LeakyReLU)
+        self.generator = MLP((cfg.noise_dim, *cfg.generator_hidden, dim), RELU)
+        self.discriminator = MLP((dim, *cfg.discriminator_hidden, 1), LEAKY_RELU)
         # RMSProp with the original's decay. Adam without momentum is RMSProp with its start
         # corrected, and torch has it in one fused call: half the GAN's time went there.
         self.generator_optimiser, self.discriminator_optimiser = (
@@ -94,16 +94,20 @@ class GoalGAN:
         losses = np.zeros((steps, 2))
         for i in range(steps):
             rows = torch.randint(len(x), (min(self.cfg.batch, len(x)),), generator=self._rng)
-            fake = torch.tanh(self.generator(self._noise(self.cfg.batch)))
+            generated = Linearised(self.generator, self._noise(self.cfg.batch))
+            fake = torch.tanh(generated.output)
 
-            real_loss = (self.discriminator(x[rows]) - target[rows]).square()
-            fake_loss = (self.discriminator(fake.detach()) + 1.0).square()
-            loss_d = torch.cat([real_loss, fake_loss]).mean()
-            _descend(self.discriminator_optimiser, loss_d)
+            judged = Linearised(self.discriminator, torch.cat([x[rows], fake]))
+            error = judged.output - torch.cat([target[rows], -torch.ones(len(fake), 1)])
+            self.discriminator.flat.grad = judged.vjp(error * (2 / len(error)))
+            self.discriminator_optimiser.step()
 
-            loss_g = (self.discriminator(fake) - self.cfg.generator_target).square().mean()
-            _descend(self.generator_optimiser, loss_g)
-            losses[i] = loss_d.item(), loss_g.item()
+            judged = Linearised(self.discriminator, fake)
+            miss = judged.output - self.cfg.generator_target
+            towards = judged.input_vjp(miss * (2 / len(miss)))
+            self.generator.flat.grad = generated.vjp(towards * (1 - fake * fake))
+            self.generator_optimiser.step()
+            losses[i] = error.square().mean().item(), miss.square().mean().item()
         discriminator, generator = losses[-max(1, steps // 4) :].mean(axis=0)
         return {"discriminator_loss": discriminator, "generator_loss": generator}
 
@@ -112,20 +116,3 @@ class GoalGAN:
 
     def _noise(self, n: int) -> Tensor:
         return torch.randn(n, self.cfg.noise_dim, generator=self._rng)
-
-
-class LeakyReLU(nn.LeakyReLU):
-    """The discriminator's activation: slope 0.1 below zero."""
-
-    def __init__(self) -> None:
-        super().__init__(0.1)
-
-
-def _descend(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
-    """One step on the optimiser's own parameters: no gradient for the opposite network."""
-    (group,) = optimiser.param_groups
-    for parameter, gradient in zip(
-        group["params"], torch.autograd.grad(loss, group["params"]), strict=True
-    ):
-        parameter.grad = gradient
-    optimiser.step()

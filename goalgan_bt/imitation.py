@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from goalgan_bt import ranks
+from goalgan_bt.mlp import Linearised
 from goalgan_bt.policy import GaussianPolicy, log_prob, mean_kl
 
 
@@ -51,25 +53,26 @@ class Imitation:
         """
         if len(obs) == 0:
             return {}
-        params = list(self.policy.net.parameters())
+        params = self.policy.net.flat
         with torch.no_grad():
             old_mean, old_log_std = self.policy(reference)
+            n = ranks.total(torch.tensor(float(len(reference)))).item()
         first_loss, kl, taken = float("nan"), 0.0, 0
         for _ in range(self.cfg.steps):
             rows = torch.randint(len(obs), (self.cfg.batch,), generator=self._rng)
-            mean, log_std = self.policy(obs[rows])
-            loss = -log_prob(mean, log_std.detach(), actions[rows]).mean()
+            at = Linearised(self.policy.net, obs[rows])
             if taken == 0:
-                first_loss = loss.item()
-            before = [p.detach().clone() for p in params]
-            self.optimiser.zero_grad(set_to_none=True)
-            loss.backward()
+                first_loss = -log_prob(at.output, old_log_std, actions[rows]).mean().item()
+            # The gradient of -log pi(a | s) in the mean.
+            u = (at.output - actions[rows]) * torch.exp(-2 * old_log_std) / len(rows)
+            before = params.detach().clone()
+            params.grad = at.vjp(u)
             self.optimiser.step()
             with torch.no_grad():
-                new_kl = mean_kl(old_mean, old_log_std, *self.policy(reference)).item()
+                kls = len(reference) * mean_kl(old_mean, old_log_std, *self.policy(reference))
+                new_kl = ranks.total(kls).item() / n
                 if not new_kl <= self.cfg.max_kl:
-                    for p, old in zip(params, before, strict=True):
-                        p.copy_(old)
+                    params.copy_(before)
                     break
             kl, taken = new_kl, taken + 1
         return {"loss": first_loss, "kl": kl, "steps": float(taken)}

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 
 from goalgan_bt.backtracking import BacktrackingModel, Transitions
 from goalgan_bt.config import Config
@@ -92,6 +93,11 @@ class Learner:
             "backtracking_optimiser": self.backtracking.optimiser,
             "imitation_optimiser": self.imitation.optimiser,
         }
+
+    def tensors(self) -> list[Tensor]:
+        """Every network's parameters and buffers, as they are held."""
+        networks = (module for module in self._modules().values() if isinstance(module, nn.Module))
+        return [tensor for network in networks for tensor in network.state_dict().values()]
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors and plain values only, so that it loads with `weights_only=True`."""

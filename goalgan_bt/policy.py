@@ -6,12 +6,14 @@ free parameter. Observations already hold the desired goal, so both are goal-con
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+
+from goalgan_bt import ranks
+from goalgan_bt.mlp import MLP, TANH, Linearised
 
 
 @dataclass(frozen=True)
@@ -47,30 +49,6 @@ class ValueConfig:
     """Observations per gradient step."""
 
 
-def mlp(
-    sizes: tuple[int, ...],
-    activation: type[nn.Module],
-    output_gain: float = 1.0,
-    input_gain: float = 1.0,
-) -> nn.Module:
-    """A fully connected network with orthogonal weights and zero biases.
-
-    Args:
-        sizes: units of every layer, the input first.
-        activation: between the layers, not after the last.
-        output_gain, input_gain: scale of the last and of the first layer's weights.
-    """
-    layers: list[nn.Module] = []
-    for i, (fan_in, fan_out) in enumerate(pairwise(sizes)):
-        last = i == len(sizes) - 2
-        linear = nn.Linear(fan_in, fan_out)
-        gain = output_gain if last else math.sqrt(2)
-        nn.init.orthogonal_(linear.weight, gain * (input_gain if i == 0 else 1.0))
-        nn.init.zeros_(linear.bias)
-        layers += [linear] if last else [linear, activation()]
-    return nn.Sequential(*layers)
-
-
 class Normaliser(nn.Module):
     """Running mean and variance of observations; maps them to about unit scale, within +-5."""
 
@@ -85,48 +63,45 @@ class Normaliser(nn.Module):
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
 
     def update(self, obs: Tensor) -> None:
-        """Take in more observations, (n, dim) (Chan et al.'s parallel variance)."""
-        n = len(obs)
-        var, mean = torch.var_mean(obs, dim=0, correction=0)
+        """Take in more observations, (n, dim), as many of each rank (Chan et al.'s parallel
+        variance)."""
+        n = ranks.size() * len(obs)
+        mean = ranks.mean(obs.mean(dim=0))
+        var = ranks.mean((obs - mean).square().mean(dim=0))
         total = self.count + n
         delta = mean - self.mean
         self.var = (self.var * self.count + var * n + delta**2 * self.count * n / total) / total
         self.mean = self.mean + delta * n / total
         self.count = total
 
+    def shift_and_scale(self) -> tuple[Tensor, Tensor]:
+        """What maps an observation to (obs - shift) * scale, each (dim,) float32."""
+        return self.mean.float(), torch.rsqrt(self.var + 1e-6).float()
+
     def forward(self, obs: Tensor) -> Tensor:
         """Normalised observations, (n, dim) -> (n, dim) float32."""
-        scale = torch.rsqrt(self.var + 1e-6).float()
-        return ((obs - self.mean.float()) * scale).clamp_(-5.0, 5.0)
+        return normalise(obs, *self.shift_and_scale())
 
 
-class MeanNetwork(nn.Module):
-    """The policy's mean: an MLP plus a linear map, both of the normalised observation.
-
-    Linear feedback carries much of locomotion (Rajeswaran et al. 2017); beside the MLP it makes
-    the Ant learn faster (docs/LOG.md). It starts at zero.
-    """
-
-    def __init__(self, sizes: tuple[int, ...], input_gain: float = 1.0) -> None:
-        super().__init__()
-        self.mlp = mlp(sizes, nn.Tanh, output_gain=0.01, input_gain=input_gain)
-        self.linear = nn.Linear(sizes[0], sizes[-1], bias=False)
-        nn.init.zeros_(self.linear.weight)
-
-    def forward(self, normalised: Tensor) -> Tensor:
-        """(n, obs_dim) -> (n, act_dim)."""
-        return torch.as_tensor(self.mlp(normalised) + self.linear(normalised))
+def normalise(obs: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
+    """(obs - shift) * scale within +-5, (n, dim) -> (n, dim)."""
+    return (obs - shift).mul_(scale).clamp_(-5.0, 5.0)
 
 
 class GaussianPolicy(nn.Module):
-    """pi(a | s, g): a diagonal Gaussian whose mean is a `MeanNetwork`."""
+    """pi(a | s, g): a diagonal Gaussian whose mean is an MLP plus a linear map.
+
+    Linear feedback carries much of locomotion (Rajeswaran et al. 2017); beside the MLP it makes
+    the Ant learn faster (docs/LOG.md).
+    """
 
     max_std: Tensor
 
     def __init__(self, obs_dim: int, act_dim: int, cfg: PolicyConfig) -> None:
         super().__init__()
         self.normaliser = Normaliser(obs_dim)
-        self.net = MeanNetwork((obs_dim, *cfg.hidden, act_dim), cfg.input_gain)
+        sizes = (obs_dim, *cfg.hidden, act_dim)
+        self.net = MLP(sizes, TANH, output_gain=0.01, input_gain=cfg.input_gain, skip=True)
         self.log_std = nn.Parameter(torch.full((act_dim,), math.log(cfg.init_std)))
         self.cfg = cfg
         # A buffer: whoever loads the policy acts with the noise that it had.
@@ -139,25 +114,48 @@ class GaussianPolicy(nn.Module):
         cap = math.inf if last is None else first + min(progress, 1.0) * (last - first)
         self.max_std.fill_(cap)
 
+    def bounded_log_std(self) -> Tensor:
+        """Log standard deviation of the actions, (act_dim,)."""
+        return self.log_std.clamp(math.log(self.cfg.min_std), math.log(self.max_std.item()))
+
     def forward(self, normalised: Tensor) -> tuple[Tensor, Tensor]:
         """Mean (n, act_dim) and log standard deviation (act_dim,) at normalised observations."""
-        log_std = self.log_std.clamp(math.log(self.cfg.min_std), math.log(self.max_std.item()))
-        return self.net(normalised), log_std
+        return self.net(normalised), self.bounded_log_std()
+
+
+class Actor:
+    """A policy as it was when this was made, quick to ask.
+
+    Args:
+        policy: pi.
+    """
+
+    @torch.no_grad()
+    def __init__(self, policy: GaussianPolicy) -> None:
+        self._shift, self._scale = policy.normaliser.shift_and_scale()
+        *layers, skip = policy.net.views(policy.net.flat.clone())
+        weights, biases = [weight.T for weight in layers[::2]], layers[1::2]
+        *self._hidden, self._output = zip(weights, biases, strict=True)
+        self._skip = skip.T
+        self.std = policy.bounded_log_std().exp()
 
     @torch.inference_mode()
-    def act(
-        self, obs: NDArray[np.float32], generator: torch.Generator | None
-    ) -> NDArray[np.float32]:
+    def __call__(self, obs: NDArray[np.float32], noise: Tensor | None) -> NDArray[np.float32]:
         """Actions for raw observations, (n, obs_dim) -> (n, act_dim), not clipped.
 
         Args:
             obs: as the environment gives them.
-            generator: noise of the Gaussian; None acts with the mean (deterministic policy).
+            noise: (n, act_dim) standard normal; None acts with the mean (deterministic policy).
         """
-        mean, log_std = self(self.normaliser(torch.from_numpy(obs)))
-        if generator is not None:
-            mean = mean + log_std.exp() * torch.randn(mean.shape, generator=generator)
-        return mean.numpy()
+        x = normalise(torch.from_numpy(obs), self._shift, self._scale)
+        h = x
+        for weight, bias in self._hidden:
+            h = torch.addmm(bias, h, weight).tanh_()
+        weight, bias = self._output
+        actions = torch.addmm(bias, h, weight).addmm_(x, self._skip)
+        if noise is not None:
+            actions.addcmul_(noise, self.std)
+        return actions.numpy()
 
 
 def log_prob(mean: Tensor, log_std: Tensor, actions: Tensor) -> Tensor:
@@ -179,7 +177,7 @@ class ValueFunction(nn.Module):
     def __init__(self, obs_dim: int, cfg: ValueConfig) -> None:
         super().__init__()
         self.cfg = cfg
-        self.net = mlp((obs_dim, *cfg.hidden, 1), nn.Tanh, input_gain=cfg.input_gain)
+        self.net = MLP((obs_dim, *cfg.hidden, 1), TANH, input_gain=cfg.input_gain)
         self.optimiser = torch.optim.Adam(self.net.parameters(), lr=cfg.learning_rate, fused=True)
 
     def forward(self, normalised: Tensor) -> Tensor:
@@ -190,13 +188,15 @@ class ValueFunction(nn.Module):
         self, normalised: Tensor, returns: Tensor, generator: torch.Generator
     ) -> dict[str, float]:
         """Regress on returns: normalised (n, obs_dim), returns (n,). Gives the mean loss."""
-        losses = []
+        n, losses = len(returns), []
         for _ in range(self.cfg.epochs):
-            order = torch.randperm(len(returns), generator=generator)
-            for rows in order.split(self.cfg.minibatch):
-                loss = (self(normalised[rows]) - returns[rows]).square().mean()
-                self.optimiser.zero_grad(set_to_none=True)
-                loss.backward()
+            order = torch.randperm(ranks.size() * n, generator=generator)
+            for minibatch in order.split(self.cfg.minibatch):
+                rows = ranks.mine(minibatch, n)
+                at = Linearised(self.net, normalised[rows])
+                error = at.output - returns[rows, None]
+                gradient = at.vjp(error * (2 / len(minibatch)))
+                self.net.flat.grad = ranks.total(gradient, beside=True)
                 self.optimiser.step()
-                losses.append(loss.item())
-        return {"loss": float(np.mean(losses))}
+                losses.append(error.square().sum() / len(minibatch))
+        return {"loss": ranks.total(torch.stack(losses), beside=True).mean().item()}

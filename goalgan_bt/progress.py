@@ -35,8 +35,6 @@ class Progress:
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
 
     def __enter__(self) -> "Progress":
-        if self._live is not None:
-            self._live.start()
         return self
 
     def __exit__(
@@ -52,6 +50,7 @@ class Progress:
         """Show a row of metrics and the estimated time left, seconds."""
         self._seen.update({name: value for name, value in row.items() if value == value})
         if self._live is not None:
+            self._live.start()  # with the first report: a rank that reports nothing shows nothing
             self._live.update(self._table(left), refresh=True)
             return
         parts = [f"{time.strftime('%H:%M:%S')} it {row['iteration']:.0f}"]

@@ -1,21 +1,25 @@
 """Rollouts: what the policy did in N simulations over T actions, and which episodes ended.
 
 Simulations go on from one batch to the next, so that a batch of 50 actions and episodes of 250 fit
-together.
+together. Where several processes train together, each runs its share of the simulations, with the
+same random numbers that one process alone would give them.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
+from goalgan_bt import ranks
 from goalgan_bt.envs.batch import GoalEnv, Ids
 from goalgan_bt.envs.maze import BoolArray, FloatArray
-from goalgan_bt.policy import GaussianPolicy
+from goalgan_bt.policy import Actor, GaussianPolicy
 
 Float32 = NDArray[np.float32]
 
@@ -25,7 +29,7 @@ class RolloutConfig:
     """Collection of experience."""
 
     num_envs: int = 512
-    """Simulations side by side."""
+    """Simulations side by side, in all processes together."""
     steps: int = 100
     """Actions in each simulation per policy update; the batch has num_envs * steps of them."""
     chain: float = 0.5
@@ -36,7 +40,7 @@ class RolloutConfig:
 
 @dataclass
 class Rollouts:
-    """A batch, time first.
+    """A batch, time first (in memory, simulation first: see `flat`).
 
     obs: (T, N, obs_dim); actions: (T, N, act_dim) as sampled; rewards, terminated, truncated:
     (T, N); last_obs: (N, obs_dim) what followed the last step; truncated_obs: (K, obs_dim) what
@@ -68,9 +72,15 @@ class Rollouts:
         return following
 
 
+def flat(array: np.ndarray) -> Tensor:
+    """(T, N, ...) as a tensor (N * T, ...), simulation by simulation, sharing its memory if it is
+    one of the rollouts'. The rows of one process are then a piece of those of all processes."""
+    return torch.from_numpy(array.swapaxes(0, 1)).flatten(0, 1)
+
+
 @dataclass
 class Episodes:
-    """Episodes that ended in a batch, E of them.
+    """Episodes that ended in a batch, E of them, simulation by simulation.
 
     goals: (E, goal_dim); success: (E,) whether the goal was reached; from_start: (E,) whether the
     episode began in the start state; lengths: (E,) actions.
@@ -107,36 +117,46 @@ class Collector:
         self.env, self.cfg, self._rng, self._noise = env, cfg, rng, noise
         n = env.num_envs
         self._all = np.arange(n)
+        self._total = ranks.size() * n
+        self._mine = slice(ranks.rank() * n, (ranks.rank() + 1) * n)
         self._from_start = np.zeros(n, dtype=bool)
         # Every unfinished episode, action by action: successes are known only when they end.
         self._age = np.zeros(n, dtype=np.int64)  # actions since the episode began
         longest = math.ceil(env.horizon / env.action_repeat)
         self._states = np.zeros((longest + 1, n, env.state_dim), dtype=np.float32)
         self._actions = np.zeros((longest, n, env.act_dim), dtype=np.float32)
-        shape = (cfg.steps, n)
-        self._obs = np.zeros((*shape, env.obs_dim), dtype=np.float32)
-        self._sampled = np.zeros((*shape, env.act_dim), dtype=np.float32)
-        self._rewards = np.zeros(shape, dtype=np.float32)
-        self._achieved = np.zeros((*shape, env.goal_dim), dtype=np.float32)
-        self._terminated = np.zeros(shape, dtype=bool)
-        self._truncated = np.zeros(shape, dtype=bool)
+        self._obs = self._table(np.float32, env.obs_dim)
+        self._sampled = self._table(np.float32, env.act_dim)
+        self._rewards = self._table(np.float32)
+        self._achieved = self._table(np.float32, env.goal_dim)
+        self._terminated = self._table(np.bool_)
+        self._truncated = self._table(np.bool_)
+
+    def _table(self, dtype: type[np.generic], *row: int) -> NDArray[Any]:
+        """Zeros, (T, N, *row), with the steps of one simulation side by side in memory."""
+        return np.zeros((self.env.num_envs, self.cfg.steps, *row), dtype).swapaxes(0, 1)
 
     def begin(self, goals: FloatArray) -> None:
         """Start every simulation anew, each with one of the goals (G, goal_dim)."""
-        self._reset(self._all, goals)
+        self._reset(self._all, pick(goals, self._rng.random(self._total)[self._mine]))
 
     def collect(self, policy: GaussianPolicy, goals: FloatArray) -> tuple[Rollouts, Episodes]:
         """Take `cfg.steps` actions in every simulation; new episodes draw from goals (G, goal_dim).
+        The rollouts are this rank's, the episodes those of all ranks.
 
         The arrays of the rollouts are reused by the next call.
         """
-        env, ids = self.env, self._all
+        env, ids, steps = self.env, self._all, self.cfg.steps
+        act = Actor(policy)
+        noise = torch.randn(steps, self._total, env.act_dim, generator=self._noise)[:, self._mine]
+        # For each step: a draw of whether the next episode is chained and of its goal.
+        draws = self._rng.random((steps, 2, self._total))[..., self._mine]
         truncated_obs = []
         ended: list[tuple[Ids, BoolArray, FloatArray, BoolArray, NDArray[np.int64]]] = []
-        successes: list[tuple[Float32, Float32]] = []
+        successes: list[tuple[int, Float32, Float32]] = []
         obs = env.observe(ids)
-        for t in range(self.cfg.steps):
-            actions = policy.act(obs, self._noise)
+        for t in range(steps):
+            actions = act(obs, noise[t])
             self._obs[t], self._sampled[t] = obs, actions
             step = env.step(ids, actions)
             self._actions[self._age, ids] = step.actions
@@ -153,13 +173,14 @@ class Collector:
                 ended.append((done, reached, env.goals[done], self._from_start[done], lengths))
                 for i, length in zip(done[reached], lengths[reached], strict=True):
                     successes.append(
-                        (self._states[: length + 1, i].copy(), self._actions[:length, i].copy())
+                        (i, self._states[: length + 1, i].copy(), self._actions[:length, i].copy())
                     )
                 truncated_obs.append(obs[step.truncated])
                 fell = step.terminated[done] & ~reached
-                chained = ~fell & (self._rng.random(len(done)) < self.cfg.chain)
-                self._chain(done[chained], goals)
-                self._reset(done[~chained], goals)
+                chained = ~fell & (draws[t, 0, done] < self.cfg.chain)
+                following = pick(goals, draws[t, 1, done])
+                self._chain(done[chained], following[chained])
+                self._reset(done[~chained], following[~chained])
                 obs[done] = env.observe(done)
 
         rollouts = Rollouts(
@@ -174,37 +195,46 @@ class Collector:
         )
         return rollouts, self._episodes(ended, successes)
 
-    def _draw(self, goals: FloatArray, n: int) -> FloatArray:
-        return goals[self._rng.integers(len(goals), size=n)]
-
     def _reset(self, ids: Ids, goals: FloatArray) -> None:
         if len(ids) == 0:
             return
-        self.env.reset(ids, self._draw(goals, len(ids)))
+        self.env.reset(ids, goals)
         self._from_start[ids] = True
         self._age[ids] = 0
         self._states[0, ids] = self.env.start_state
 
     def _chain(self, ids: Ids, goals: FloatArray) -> None:
+        if len(ids) == 0:
+            return
         self._states[0, ids] = self._states[self._age[ids], ids]
         self._age[ids] = 0
-        self.env.set_goals(ids, self._draw(goals, len(ids)))
+        self.env.set_goals(ids, goals)
         self._from_start[ids] = False
 
-    def _episodes(self, ended: list[Any], successes: list[tuple[Float32, Float32]]) -> Episodes:
+    def _episodes(
+        self, ended: list[Any], successes: list[tuple[int, Float32, Float32]]
+    ) -> Episodes:
         env = self.env
-        _, reached, goals, from_start, lengths = (
+        ids, reached, goals, from_start, lengths = (
             [np.concatenate(column) for column in zip(*ended, strict=True)]
             if ended
             else [np.empty(0)] * 2 + [np.empty((0, env.goal_dim))] + [np.empty(0)] * 2
         )
+        order = np.argsort(ids, kind="stable")
+        successes.sort(key=itemgetter(0))
         no_states = np.empty((0, env.state_dim), np.float32)
+        no_actions = np.empty((0, env.act_dim), np.float32)
         return Episodes(
-            goals,
-            reached.astype(bool),
-            from_start.astype(bool),
-            lengths.astype(np.int64),
-            np.concatenate([no_states, *(s[:-1] for s, _ in successes)]),
-            np.concatenate([np.empty((0, env.act_dim), np.float32), *(a for _, a in successes)]),
-            np.concatenate([no_states, *(s[1:] for s, _ in successes)]),
+            ranks.gather(goals[order]),
+            ranks.gather(reached[order].astype(bool)),
+            ranks.gather(from_start[order].astype(bool)),
+            ranks.gather(lengths[order].astype(np.int64)),
+            ranks.gather(np.concatenate([no_states, *(s[:-1] for _, s, _ in successes)])),
+            ranks.gather(np.concatenate([no_actions, *(a for *_, a in successes)])),
+            ranks.gather(np.concatenate([no_states, *(s[1:] for _, s, _ in successes)])),
         )
+
+
+def pick(goals: FloatArray, draws: FloatArray) -> FloatArray:
+    """Goals (G, goal_dim) chosen by uniform draws from [0, 1), (n,) -> (n, goal_dim)."""
+    return goals[(draws * len(goals)).astype(np.int64)]

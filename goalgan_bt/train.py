@@ -22,18 +22,18 @@ if __name__ == "__main__":
 import errno
 import math
 import time
-from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from goalgan_bt import checkpoint, config, envs, record, trpo
+from goalgan_bt import checkpoint, config, envs, ranks, record, trpo
 from goalgan_bt.advantage import gae
 from goalgan_bt.backtracking import recall_traces
 from goalgan_bt.command_line import UsageError
@@ -45,7 +45,7 @@ from goalgan_bt.envs.maze import MapError, Maze
 from goalgan_bt.learner import Learner
 from goalgan_bt.progress import Progress, complain, say
 from goalgan_bt.record import Record
-from goalgan_bt.rollout import Collector, Float32, Rollouts
+from goalgan_bt.rollout import Collector, Float32, Rollouts, flat
 from goalgan_bt.viz.child import Page
 
 TEST_ENVS = 512  # simulations side by side when coverage is measured
@@ -71,7 +71,13 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
         stop: asked after every iteration whether to end early.
     """
     torch.set_num_threads(cfg.learning_threads)
-    env, test_env = make_env(cfg, cfg.rollout.num_envs), make_env(cfg, TEST_ENVS)
+    if cfg.rollout.num_envs % ranks.size():
+        raise config.ConfigError(
+            f"--rollout.num-envs must be a multiple of the {ranks.size()} ranks, "
+            f"not {cfg.rollout.num_envs}"
+        )
+    env = make_env(cfg, cfg.rollout.num_envs // ranks.size())
+    test_env = make_env(cfg, TEST_ENVS)
     learner = Learner(env, cfg)
     if cfg.resume is not None:
         checkpoint.load(learner, folder)
@@ -80,10 +86,13 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                 f"{folder} has reached its limits ({learner.iteration} iterations, "
                 f"{learner.steps['train']} steps): ask for more, for example with --total-steps"
             )
-    records = Record(folder, learner.iteration)
-    config.save(cfg, folder)
+    records = None
+    if ranks.rank() == 0:
+        records = Record(folder, learner.iteration)
+        config.save(cfg, folder)
     policy, rng, noise = learner.policy, learner.rng, learner.noise
     collector = Collector(env, cfg.rollout, rng, noise["rollout"])
+    batch_steps = cfg.rollout.num_envs * cfg.rollout.steps * cfg.action_repeat
     test_goals = env.test_goals()
     clock = Clock(learner.seconds)
     coverage = float("nan")
@@ -97,20 +106,19 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
         collector.begin(anywhere)
         rollouts, episodes = collector.collect(policy, anywhere)
         learner.remember(episodes)
-        learner.steps["train"] += rollouts.rewards.size * cfg.action_repeat
+        learner.steps["train"] += batch_steps
         policy.normaliser.update(flat(rollouts.obs))
-        visited = env.achieved_goals(env.read_states(everyone))
+        visited = ranks.gather(env.achieved_goals(env.read_states(everyone)))
         learner.visited.add(visited)
         learner.gan.fit(visited, np.ones(len(visited), dtype=bool), cfg.gan.pretrain_steps)
     else:
         collector.begin(learner.gan.sample(cfg.goals.new))
 
-    with Progress(f"{env.name}, seed {cfg.seed}") as progress, ThreadPoolExecutor(1) as beside:
+    with Progress(f"{env.name}, seed {cfg.seed}") as terminal, Beside() as beside:
         last = False
         while not last:
             learner.iteration += 1
-            metrics: dict[str, float] = {"iteration": learner.iteration}
-            policy.cap_std(finished(cfg, learner, clock.total()))
+            policy.cap_std(agreed(finished(cfg, learner, clock.total())))
 
             # Goals: most imagined by the generator, some remembered so that old skills stay.
             imagined = learner.gan.sample(cfg.goals.new)
@@ -120,17 +128,18 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                 # Rollouts: every simulation goes on where it was.
                 with clock.measure("simulation"):
                     rollouts, episodes = collector.collect(policy, goals)
-                learner.steps["train"] += rollouts.rewards.size * cfg.action_repeat
+                learner.steps["train"] += batch_steps
 
                 with clock.measure("learning"):
                     # Policy: a trust-region step on what happened. The value function and the
-                    # backtracking model (what preceded success) share nothing with it, and so
-                    # they learn beside it, on the second core.
+                    # backtracking model (what preceded success) learn beside it, and beside the
+                    # next rollouts: they are needed again only after those.
+                    beside.wait("value", "backtracking")
                     obs = policy.normaliser(flat(rollouts.obs))
                     learner.remember(episodes)
                     advantages, returns = advantages_and_returns(learner, rollouts, obs, cfg)
-                    value_fit = beside.submit(learner.value.fit, obs, flat(returns), noise["value"])
-                    model_fit = beside.submit(learner.backtracking.fit, learner.transitions)
+                    beside.start("value", learner.value.fit, obs, flat(returns), noise["value"])
+                    beside.start("backtracking", learner.backtracking.fit, learner.transitions)
                     step = trpo.update(
                         policy,
                         obs,
@@ -139,8 +148,6 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                         cfg.trpo,
                         noise["trpo"],
                     )
-                    metrics |= group("trpo", step) | group("value", value_fit.result())
-                    metrics |= group("backtracking", model_fit.result())
 
             # Labels: goals neither hopeless nor mastered teach the generator what to propose next.
             if cfg.goals.label_rollouts:
@@ -152,13 +159,14 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
             else:
                 success = learner.estimator(goals)
             with clock.measure("learning"):
-                learner.visited.add(env.achieved_goals(env.read_states(everyone)))
+                learner.visited.add(ranks.gather(env.achieved_goals(env.read_states(everyone))))
                 labels = learner.intermediate(goals, success)
                 learner.replay.add(goals[labels])
                 # The estimator's labels are free: the GAN also learns from goals that nobody tried.
                 others = rng.uniform(env.goal_low, env.goal_high, (extra, env.goal_dim))
                 other_labels = learner.intermediate(others, learner.estimator(others))
-                gan_fit = beside.submit(
+                beside.start(
+                    "gan",
                     learner.gan.fit,
                     np.concatenate([goals, others]),
                     np.concatenate([labels, other_labels]),
@@ -172,6 +180,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                     cfg.backtracking.max_shift,
                     rng,
                 )
+                beside.wait("backtracking")
                 traces = recall_traces(
                     learner.backtracking,
                     env,
@@ -179,24 +188,21 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                     length=math.ceil(cfg.backtracking.trace_length / cfg.action_repeat),
                 )
                 trace_obs, trace_actions = traces.pairs(env)
-                reference = obs[:: max(1, len(obs) // KL_SAMPLE)]
-                metrics |= group(
-                    "imitation",
-                    learner.imitation.update(
-                        policy.normaliser(trace_obs), trace_actions, reference
-                    ),
+                every = max(1, ranks.size() * len(obs) // KL_SAMPLE)
+                rows = torch.arange(0, ranks.size() * len(obs), every)
+                imitated = learner.imitation.update(
+                    policy.normaliser(trace_obs), trace_actions, obs[ranks.mine(rows, len(obs))]
                 )
-                metrics |= group("gan", gan_fit.result())
                 # Only now: the policy must not change under data that it made. The last batch
                 # stands for all of the iteration's.
                 policy.normaliser.update(flat(rollouts.obs))
 
             # Coverage, once in a while; then everything that a viewer reads.
-            last = finished(cfg, learner, clock.total()) >= 1 or (
-                stop is not None and stop.requested
-            )
+            done = agreed(finished(cfg, learner, clock.total()))
+            last = ranks.any_of(done >= 1 or (stop is not None and stop.requested))
             measured = np.full(len(test_goals), np.nan)
             measure = learner.steps["train"] >= learner.next_coverage or last
+            evaluation: dict[str, float] = {}
             if measure:
                 with clock.measure("evaluation"):
                     measured, steps = success_rate(
@@ -205,31 +211,41 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                     by_mean, mean_steps = success_rate(test_env, policy, test_goals, 1, None)
                 learner.steps["eval"] += steps + mean_steps
                 learner.next_coverage = learner.steps["train"] + cfg.coverage.every
-                coverage = metrics["eval/coverage"] = float(measured.mean())
-                metrics["eval/coverage_deterministic"] = float(by_mean.mean())
+                coverage = float(measured.mean())
+                evaluation = {"coverage": coverage, "coverage_deterministic": by_mean.mean()}
+            with clock.measure("learning"):
+                beside.wait("value", "gan")
+                ranks.agree(learner.tensors())
+            learner.seconds = clock.total()
 
+            if records is None:
+                continue
             estimate = learner.estimated_success(test_goals)
-            metrics |= group("steps", learner.steps)
-            metrics |= group("time", clock.metrics(learner.steps["train"]))
-            metrics |= {
-                "rollout/success": float(episodes.success.mean())
-                if len(episodes.success)
-                else np.nan,
-                "rollout/std": float(policy(reference)[1].detach().exp().mean()),
-                "curriculum/intermediate": float(labels.mean()),
-                "curriculum/too_easy": float((success >= cfg.goals.r_max).mean()),
-                "curriculum/replay": len(learner.replay),
-                "curriculum/estimated_coverage": float(estimate.mean()),
-                "backtracking/traces": traces.valid.shape[1],
-                "backtracking/valid": float(traces.valid.mean()) if traces.valid.size else np.nan,
-            }
+            metrics = (
+                {"iteration": learner.iteration}
+                | group("trpo", step)
+                | beside.metrics
+                | group("imitation", imitated)
+                | group("eval", evaluation)
+                | group("steps", learner.steps)
+                | group("time", clock.metrics(learner.steps["train"]))
+                | {
+                    "rollout/success": mean(episodes.success),
+                    "rollout/std": float(policy.bounded_log_std().detach().exp().mean()),
+                    "curriculum/intermediate": mean(labels),
+                    "curriculum/too_easy": mean(success >= cfg.goals.r_max),
+                    "curriculum/replay": len(learner.replay),
+                    "curriculum/estimated_coverage": mean(estimate),
+                    "backtracking/traces": traces.valid.shape[1],
+                    "backtracking/valid": mean(traces.valid),
+                }
+            )
             if measure:
-                learner.seconds = clock.total()
                 checkpoint.save(learner, folder)
             records.metrics(metrics)
             if measure or learner.iteration % cfg.report_every == 0:
-                done = finished(cfg, learner, clock.total())
-                progress.report(metrics, clock.total() * max(1 / done - 1, 0) if done else np.inf)
+                left = clock.total() * max(1 / done - 1, 0) if done else np.inf
+                terminal.report(metrics, left)
                 records.frame(
                     learner.iteration,
                     goals=goals,
@@ -244,8 +260,8 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                     estimate=estimate,
                     coverage=measured,
                 )
-    complete = finished(cfg, learner, clock.total()) >= 1
-    records.close("complete" if complete else "stopped early: --resume goes on")
+    if records is not None:
+        records.close("complete" if done >= 1 else "stopped early: --resume goes on")
     return Trained(coverage, learner.steps["train"])
 
 
@@ -257,17 +273,15 @@ def advantages_and_returns(
     Args:
         learner: whose value function judges.
         rollouts: the batch, (T, N, ...).
-        obs: (T * N, obs_dim) its normalised observations.
+        obs: (N * T, obs_dim) its normalised observations, flat.
         cfg: settings.
     """
     policy, value = learner.policy, learner.value
 
-    @torch.no_grad()
     def values_of(raw: Float32) -> Float32:
         return value(policy.normaliser(torch.from_numpy(raw))).numpy()
 
-    with torch.no_grad():
-        values = value(obs).view(rollouts.rewards.shape).numpy()
+    values = value(obs).view(rollouts.rewards.T.shape).numpy().T
     return gae(
         rollouts.rewards,
         values,
@@ -277,11 +291,6 @@ def advantages_and_returns(
         cfg.discount,
         cfg.gae_lambda,
     )
-
-
-def flat(array: np.ndarray) -> Tensor:
-    """(T, N, ...) as a tensor (T * N, ...) that shares its memory."""
-    return torch.from_numpy(array).flatten(0, 1)
 
 
 def group(name: str, values: Mapping[str, float]) -> dict[str, float]:
@@ -298,6 +307,16 @@ def finished(cfg: Config, learner: Learner, seconds: float) -> float:
     )
 
 
+def agreed(progress: float) -> float:
+    """The same progress on all ranks, whose clocks differ: their mean."""
+    return ranks.mean(torch.tensor(progress, dtype=torch.float64)).item()
+
+
+def mean(values: np.ndarray) -> float:
+    """The mean; NaN of nothing."""
+    return float(values.mean()) if values.size else float("nan")
+
+
 def make_env(cfg: Config, num_envs: int, maze: Maze | None = None) -> GoalEnv:
     """The environment that the settings name, in another maze if one is given."""
     return envs.make(
@@ -311,6 +330,35 @@ def make_env(cfg: Config, num_envs: int, maze: Maze | None = None) -> GoalEnv:
         map_file=cfg.map,
         maze=maze,
     )
+
+
+class Beside:
+    """A thread beside the main one: what learns there may go on during the next rollouts.
+
+    Attributes:
+        metrics: the last ones of all that was waited for.
+    """
+
+    def __init__(self) -> None:
+        self.metrics: dict[str, float] = {}
+        self._thread = ThreadPoolExecutor(1)
+        self._running: dict[str, Future[dict[str, float]]] = {}
+
+    def __enter__(self) -> "Beside":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._thread.shutdown()
+
+    def start(self, name: str, fit: Callable[..., dict[str, float]], *args: Any) -> None:
+        """Call fit(*args), which gives metrics, after what was started before."""
+        self._running[name] = self._thread.submit(fit, *args)
+
+    def wait(self, *names: str) -> None:
+        """Until these have ended, if they were started."""
+        for name in names:
+            if name in self._running:
+                self.metrics |= group(name, self._running.pop(name).result())
 
 
 class Clock:

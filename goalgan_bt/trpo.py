@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
+from goalgan_bt import ranks
+from goalgan_bt.mlp import CHUNK, Linearised
 from goalgan_bt.policy import GaussianPolicy, log_prob, mean_kl
 
 
@@ -68,21 +69,17 @@ def fisher_vector_product(
         normalised: (n, obs_dim) normalised observations.
         damping: added to the diagonal.
     """
-    params = list(policy.net.parameters())
-    mean, log_std = policy(normalised)
-    precision = torch.exp(-2 * log_std).detach() / len(mean)
-    # J'u is linear in u, so that its derivative along v is Jv (the double-backward trick).
-    u = torch.zeros_like(mean, requires_grad=True)
-    jt_u = torch.autograd.grad(mean, params, u, create_graph=True)
-    flat_jt_u = torch.cat([g.reshape(-1) for g in jt_u])
-    free = (log_std.detach() == policy.log_std.detach()).float()  # 0 where the floor holds it
-    split = len(flat_jt_u)
+    at = Linearised(policy.net, normalised)
+    log_std = policy.bounded_log_std().detach()
+    n = ranks.total(torch.tensor(float(len(normalised)))).item()
+    precision = torch.exp(-2 * log_std) / n
+    free = (log_std == policy.log_std.detach()).to(precision.dtype)  # 0 where a bound holds it
+    split = -len(log_std)
 
     def product(v: Tensor) -> Tensor:
-        (jv,) = torch.autograd.grad(flat_jt_u, u, v[:split], retain_graph=True)
-        jt_jv = torch.autograd.grad(mean, params, precision * jv, retain_graph=True)
-        net_part = torch.cat([g.reshape(-1) for g in jt_jv])
-        return torch.cat([net_part, 2.0 * free * v[split:]]) + damping * v
+        net_part = at.vjp(at.jvp(v[:split]).mul_(precision))
+        ranks.total(net_part)
+        return torch.cat([net_part, 2.0 * free * v[split:]]).add_(v, alpha=damping)
 
     return product
 
@@ -113,6 +110,41 @@ def line_search(
     return None
 
 
+@torch.no_grad()
+def surrogate_gradient(
+    policy: GaussianPolicy, normalised: Tensor, actions: Tensor, advantages: Tensor
+) -> tuple[Tensor, Tensor]:
+    """E[A grad log pi(a | s)], the gradient of E[ratio * A] where the ratio is 1.
+
+    Args:
+        policy: pi.
+        normalised: (n, obs_dim); actions: (n, act_dim); advantages: (n,).
+
+    Returns:
+        The means of the policy, (n, act_dim), and the gradient over all ranks, (p,).
+    """
+    log_std = policy.bounded_log_std()
+    free = (log_std == policy.log_std).to(log_std.dtype)  # 0 where a bound holds it
+    gradients, means = [], []
+    columns = (normalised, actions, advantages[:, None] / len(advantages))
+    for obs, acts, weight in zip(*(column.split(CHUNK) for column in columns), strict=True):
+        at = Linearised(policy.net, obs)
+        z = (acts - at.output) * torch.exp(-log_std)
+        of_net = at.vjp(weight * z * torch.exp(-log_std))
+        of_std = free * (weight * (z * z - 1)).sum(dim=0)
+        gradients.append(torch.cat([of_net, of_std]))
+        means.append(at.output)
+    return torch.cat(means), ranks.mean(torch.stack(gradients).sum(dim=0))
+
+
+def standardised(advantages: Tensor) -> Tensor:
+    """Advantages (n,) with zero mean and unit standard deviation over all ranks, (n,)."""
+    centred = advantages - ranks.mean(advantages.mean())
+    n = ranks.size() * len(advantages)
+    variance = ranks.total(centred.square().sum()) / max(1, n - 1)
+    return centred / (variance.sqrt() + 1e-8)
+
+
 def update(
     policy: GaussianPolicy,
     normalised: Tensor,
@@ -125,7 +157,7 @@ def update(
 
     Args:
         policy: pi, changed in place; not at all if no step was accepted or any was not finite.
-        normalised: (n, obs_dim) normalised observations.
+        normalised: (n, obs_dim) normalised observations; of several ranks, each brings as many.
         actions: (n, act_dim) as sampled, before clipping.
         advantages: (n,), normalised here.
         cfg: settings.
@@ -134,15 +166,10 @@ def update(
     Returns:
         surrogate (its gain), kl, gradient_norm, accepted (1 or 0), nonfinite (1 or 0).
     """
-    params = [*policy.net.parameters(), policy.log_std]
-    advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-    mean, log_std = policy(normalised)
-    logp = log_prob(mean, log_std, actions)
-    old_mean, old_log_std, old_logp = mean.detach(), log_std.detach(), logp.detach()
-
-    surrogate = (torch.exp(logp - old_logp) * advantages).mean()
-    grads = torch.autograd.grad(surrogate, params)
-    gradient = torch.cat([g.reshape(-1) for g in grads])
+    advantages = standardised(advantages)
+    old_log_std = policy.bounded_log_std().detach()
+    old_mean, gradient = surrogate_gradient(policy, normalised, actions, advantages)
+    old_logp = log_prob(old_mean, old_log_std, actions)
     stats = {"surrogate": 0.0, "kl": 0.0, "accepted": 0.0, "nonfinite": 0.0}
     stats["gradient_norm"] = gradient.norm().item()
     if not torch.isfinite(gradient).all():
@@ -150,8 +177,10 @@ def update(
 
     subset = normalised
     if cfg.fisher_fraction < 1:
-        size = max(1, int(cfg.fisher_fraction * len(normalised)))
-        subset = normalised[torch.randperm(len(normalised), generator=generator)[:size]]
+        everybodys = ranks.size() * len(normalised)
+        size = max(1, int(cfg.fisher_fraction * everybodys))
+        rows = torch.randperm(everybodys, generator=generator)[:size]
+        subset = normalised[ranks.mine(rows, len(normalised))]
     product = fisher_vector_product(policy, subset, cfg.cg_damping)
     direction = conjugate_gradient(product, gradient, cfg.cg_iters)
     curvature = direction @ product(direction)  # g' F^-1 g
@@ -159,21 +188,28 @@ def update(
     if not torch.isfinite(full_step).all():
         return stats | {"nonfinite": 1.0}
 
-    start = parameters_to_vector(params).detach()
+    params = [policy.net.flat.detach(), policy.log_std.detach()]
+    start = torch.cat(params)
+
+    def put(candidate: Tensor) -> None:
+        for param, part in zip(params, candidate.split([len(p) for p in params]), strict=True):
+            param.copy_(part)
 
     @torch.no_grad()
     def evaluate(candidate: Tensor) -> tuple[float, float]:
-        vector_to_parameters(candidate, params)
+        put(candidate)
         new_mean, new_log_std = policy(normalised)
         new_logp = log_prob(new_mean, new_log_std, actions)
         gain = ((torch.exp(new_logp - old_logp) - 1) * advantages).mean()
-        return gain.item(), mean_kl(old_mean, old_log_std, new_mean, new_log_std).item()
+        kl = mean_kl(old_mean, old_log_std, new_mean, new_log_std)
+        gain, kl = ranks.mean(torch.stack([gain, kl])).tolist()
+        return gain, kl
 
     found = line_search(
         evaluate, start, full_step, cfg.max_kl, cfg.line_search_steps, cfg.line_search_decay
     )
     if found is None:
-        vector_to_parameters(start, params)
+        put(start)
         return stats
     _, gain, kl = found  # the last evaluation left the accepted parameters in place
     return stats | {"surrogate": gain, "kl": kl, "accepted": 1.0}

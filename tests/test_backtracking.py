@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from test_mlp import by_torch
 
 from goalgan_bt import envs
 from goalgan_bt.backtracking import (
@@ -60,13 +61,18 @@ def test_negative_log_likelihood_by_hand():
     model, _ = fitted(*linear_walk(100), steps=1)
     states, actions, following = (torch.from_numpy(x) for x in linear_walk(50, seed=1))
     s, a = model.state_scale.normalise(following), model.action_scale.normalise(actions)
-    mean, log_var = model.state_net(torch.cat([s, a], dim=1)).chunk(2, dim=1)
+    nets = model.state_net, model.action_net
+    moved = by_torch(nets[0], nets[0].flat, torch.cat([s, a], dim=1))
+    mean, log_var = moved.chunk(2, dim=1)
     delta = model.delta_scale.normalise(states - following)
     state = -torch.distributions.Normal(mean, (0.5 * log_var).exp()).log_prob(delta).mean()
-    action = -torch.distributions.Normal(model.action_net(s), 1.0).log_prob(a).mean()
+    acted = by_torch(nets[1], nets[1].flat, s)
+    action = -torch.distributions.Normal(acted, 1.0).log_prob(a).mean()
     ours = model.negative_log_likelihood(following, actions, states - following)
-    assert ours[0].item() == pytest.approx(action.item(), rel=1e-5)
-    assert ours[1].item() == pytest.approx(state.item(), rel=1e-5)
+    assert ours == pytest.approx((action.item(), state.item()), rel=1e-5)
+    gradients = torch.autograd.grad(action + state, [net.flat for net in nets])
+    for net, gradient in zip(nets, gradients, strict=True):
+        assert torch.allclose(net.flat.grad, gradient, atol=1e-6)
 
 
 def test_too_few_transitions_train_nothing():

@@ -52,9 +52,8 @@ def test_losses_by_hand():
     """One step on one goal with a fixed discriminator: (2y-1-D)^2, (D+1)^2 and (D-c)^2."""
     gan = make_gan(generator_target=0.0, batch=1)
     with torch.no_grad():
-        for p in gan.discriminator.parameters():
-            p.zero_()
-        list(gan.discriminator.parameters())[-1].fill_(0.5)  # D = 0.5 everywhere
+        gan.discriminator.flat.zero_()
+        gan.discriminator.views()[-1].fill_(0.5)  # D = 0.5 everywhere
     for group in gan.discriminator_optimiser.param_groups:
         group["lr"] = 0.0
     losses = gan.fit(np.zeros((1, 2)), np.array([True]), steps=1)

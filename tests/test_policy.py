@@ -6,6 +6,7 @@ import torch
 from gymnasium.wrappers.utils import RunningMeanStd
 
 from goalgan_bt.policy import (
+    Actor,
     GaussianPolicy,
     Normaliser,
     PolicyConfig,
@@ -57,8 +58,12 @@ def test_the_std_stays_between_its_bounds():
 def test_actions_have_the_policys_mean_and_std():
     policy = GaussianPolicy(2, 2, PolicyConfig(hidden=(4,), init_std=0.5))
     obs = np.tile(np.array([[0.3, -1.0]], np.float32), (20_000, 1))
-    noisy = policy.act(obs, torch.Generator().manual_seed(0))
-    still = policy.act(obs, None)
+    policy.normaliser.update(torch.randn(100, 2) + 3)
+    act = Actor(policy)
+    noisy = act(obs, torch.randn(20_000, 2, generator=torch.Generator().manual_seed(0)))
+    still = act(obs, None)
+    mean, _ = policy(policy.normaliser(torch.from_numpy(obs)))
+    assert np.allclose(still, mean.detach(), atol=1e-6)
     assert np.allclose(still, still[0])
     assert np.allclose(noisy.mean(axis=0), still[0], atol=0.02)
     assert np.allclose(noisy.std(axis=0), 0.5, atol=0.02)

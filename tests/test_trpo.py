@@ -6,6 +6,7 @@ import pytest
 import torch
 from sb3_contrib import TRPO
 from stable_baselines3.common.logger import configure
+from test_mlp import by_torch
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from goalgan_bt import trpo
@@ -57,12 +58,7 @@ def test_fisher_vector_product_is_the_hessian_of_the_kl():
     old_mean, old_log_std = (x.detach() for x in policy(obs))
 
     def kl_of(flat):
-        parts = torch.split(flat, [p.numel() for p in params])
-        named = dict(policy.named_parameters())
-        by_id = {id(p): part.view_as(p) for p, part in zip(params, parts, strict=True)}
-        mean, log_std = torch.func.functional_call(
-            policy, {name: by_id[id(p)] for name, p in named.items()}, (obs,)
-        )
+        mean, log_std = by_torch(policy.net, flat[:-2], obs), flat[-2:]
         return mean_kl(old_mean, old_log_std, mean, log_std)
 
     hessian = torch.autograd.functional.hessian(kl_of, start)
@@ -131,6 +127,29 @@ def test_line_search_checks_both_gain_and_kl():
     assert search(lambda x: (float("nan"), float("nan"))) is None
 
 
+class Beside(torch.nn.Module):
+    """A network's output with its input beside it."""
+
+    def __init__(self, net):
+        super().__init__()
+        self.net = net
+
+    def forward(self, x):
+        return torch.cat([self.net(x), x], dim=1)
+
+
+class Sum(torch.nn.Module):
+    """A layer of what `Beside` gave first plus a layer of what it put beside it."""
+
+    def __init__(self, head, linear):
+        super().__init__()
+        self.head, self.linear = head, linear
+
+    def forward(self, x):
+        n = self.head.in_features
+        return self.head(x[:, :n]) + self.linear(x[:, n:])
+
+
 def test_same_direction_and_same_step_as_sb3_contrib():
     n, max_kl = 512, 0.01
     spaces = gymnasium.spaces
@@ -157,17 +176,17 @@ def test_same_direction_and_same_step_as_sb3_contrib():
         device="cpu",
     )
     ours = make_policy((16, 16))
+    # They have no linear map beside the MLP: it is given to their network.
+    body, head = theirs.policy.mlp_extractor.policy_net, theirs.policy.action_net
+    theirs.policy.mlp_extractor.policy_net = Beside(body)
+    theirs.policy.action_net = Sum(head, torch.nn.Linear(3, 2, bias=False))
+    their_params = [
+        *theirs.policy.mlp_extractor.policy_net.parameters(),
+        *theirs.policy.action_net.parameters(),
+        theirs.policy.log_std,
+    ]
     with torch.no_grad():
-        # They have no linear map beside the MLP: leave ours out.
-        ours.net = ours.net.mlp
-        vector_to_parameters(
-            parameters_to_vector(ours.net.parameters()),
-            [
-                *theirs.policy.mlp_extractor.policy_net.parameters(),
-                *theirs.policy.action_net.parameters(),
-            ],
-        )
-        theirs.policy.log_std.copy_(ours.log_std)
+        vector_to_parameters(parameters_to_vector(params_of(ours)), their_params)
     obs, actions, advantages = make_batch(ours, n)
     mean, log_std = ours(obs)
     buffer = theirs.rollout_buffer
@@ -188,11 +207,6 @@ def test_same_direction_and_same_step_as_sb3_contrib():
     theirs.train()
 
     step = parameters_to_vector(params_of(ours)).detach() - before
-    their_params = [
-        *theirs.policy.mlp_extractor.policy_net.parameters(),
-        *theirs.policy.action_net.parameters(),
-        theirs.policy.log_std,
-    ]
     their_step = parameters_to_vector(their_params).detach() - before
     assert stats["accepted"] == 1
     cosine = torch.nn.functional.cosine_similarity(step, their_step, dim=0).item()
