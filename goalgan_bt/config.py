@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from goalgan_bt import envs
+from goalgan_bt import envs, ranks
 from goalgan_bt.backtracking import BacktrackingConfig
 from goalgan_bt.command_line import UsageError, parse
 from goalgan_bt.coverage import CoverageConfig
@@ -63,7 +63,7 @@ class Config:
     action_repeat: int = 1
     """Steps of 0.02 s for which the policy holds each action (the original: 1)."""
     threads: int = 0
-    """Simulation threads; 0 is one per core."""
+    """Simulation threads of each process; 0 is one per core."""
     learning_threads: int = 1
     """Threads of torch. More than one pays only on idle cores: they wait for each other busily."""
     discount: float = 0.995
@@ -92,8 +92,8 @@ class Config:
 
     @property
     def num_threads(self) -> int:
-        """Threads, with 0 resolved to the cores this process may use."""
-        return self.threads or len(os.sched_getaffinity(0))
+        """Threads, with 0 resolved to this process's share of the cores that it may use."""
+        return self.threads or max(1, len(os.sched_getaffinity(0)) // ranks.here())
 
 
 ANT = Config(

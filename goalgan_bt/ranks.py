@@ -57,6 +57,11 @@ def rank() -> int:
     return dist.get_rank() if dist.is_initialized() else 0
 
 
+def speaks() -> bool:
+    """Whether this is the rank that talks to people, also before the ranks have met."""
+    return os.environ.get("RANK", "0") == "0"
+
+
 def size() -> int:
     """How many processes train together."""
     return dist.get_world_size() if dist.is_initialized() else 1
@@ -136,5 +141,6 @@ def _clear_errors() -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:  # gloo has no kind of its own
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
+        words = str(error).strip() or type(error).__name__
+        reason = words.splitlines()[0].split("] ")[-1].split(". ")[0]
         raise RankError(f"a rank of this training is gone or out of reach ({reason})") from None

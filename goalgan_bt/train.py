@@ -62,12 +62,12 @@ class Trained(NamedTuple):
     steps: int
 
 
-def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
+def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Trained:
     """Learn to reach every free point of the maze.
 
     Args:
         cfg: settings; with `resume`, the learner goes on from the folder's checkpoint.
-        folder: the run folder (see `goalgan_bt.record`).
+        folder: the run folder (see `goalgan_bt.record`); None on ranks that do not record.
         stop: asked after every iteration whether to end early.
     """
     torch.set_num_threads(cfg.learning_threads)
@@ -79,7 +79,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
     env = make_env(cfg, cfg.rollout.num_envs // ranks.size())
     test_env = make_env(cfg, TEST_ENVS)
     learner = Learner(env, cfg)
-    if cfg.resume is not None:
+    if cfg.resume is not None and folder is not None:
         checkpoint.load(learner, folder)
         if finished(cfg, learner, learner.seconds) >= 1:
             raise config.ConfigError(
@@ -87,7 +87,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                 f"{learner.steps['train']} steps): ask for more, for example with --total-steps"
             )
     records = None
-    if ranks.rank() == 0:
+    if folder is not None and ranks.rank() == 0:
         records = Record(folder, learner.iteration)
         config.save(cfg, folder)
     policy, rng, noise = learner.policy, learner.rng, learner.noise
@@ -218,7 +218,7 @@ def train(cfg: Config, folder: Path, stop: "Stop | None" = None) -> Trained:
                 ranks.agree(learner.tensors())
             learner.seconds = clock.total()
 
-            if records is None:
+            if folder is None or records is None:
                 continue
             estimate = learner.estimated_success(test_goals)
             metrics = (
@@ -427,15 +427,17 @@ def main() -> int:
     try:
         with Stop() as stop:
             cfg = config.from_command_line()
-            env = make_env(cfg, 1)
-            folder = cfg.resume or record.create_folder(cfg.out, env.name, cfg.seed)
-            if cfg.resume is None:
-                record.write_meta(folder, env.maze)
-                config.save(cfg, folder)  # the page reads it before training begins
-            say(f"run folder: {folder}")
-            if cfg.viz == "browser":
-                page = Page(folder, cfg.viz_host, cfg.viz_port)
-            coverage, steps = train(cfg, folder, stop)
+            ranks.begin()
+            if ranks.rank() == 0:
+                env = make_env(cfg, 1)
+                folder = cfg.resume or record.create_folder(cfg.out, env.name, cfg.seed)
+                if cfg.resume is None:
+                    record.write_meta(folder, env.maze)
+                    config.save(cfg, folder)  # the page reads it before training begins
+                say(f"run folder: {folder}")
+                if cfg.viz == "browser":
+                    page = Page(folder, cfg.viz_host, cfg.viz_port)
+            coverage, steps = train(cfg, folder or cfg.resume, stop)
     except KeyboardInterrupt:
         complain(f"interrupted{how_to_go_on(folder)}")
         return 130
@@ -447,8 +449,11 @@ def main() -> int:
             complain(f"standard output was closed{how_to_go_on(folder)}")
         elif isinstance(error, FileNotFoundError) and folder is not None and not folder.exists():
             complain(f"the run folder {folder} has vanished: start again")
+        elif isinstance(error, ranks.RankError):
+            complain(f"rank {ranks.rank()}: {error}{how_to_go_on(folder)}")
         elif isinstance(error, (UsageError, record.RunError, MapError, OSError)):
-            complain(str(error))
+            if ranks.speaks():  # one word is enough
+                complain(str(error))
         else:
             raise
         return 2
@@ -458,9 +463,11 @@ def main() -> int:
     else:
         if stop.signal is not None:
             name = signal.Signals(stop.signal).name
-            complain(f"stopped by {name}: go on with --resume {folder}")
+            if folder is not None:
+                complain(f"stopped by {name}: go on with --resume {folder}")
             return 130 if stop.signal == signal.SIGINT else 2
-        say(f"coverage {coverage:.3f} after {steps:,} training steps: {folder}")
+        if folder is not None:
+            say(f"coverage {coverage:.3f} after {steps:,} training steps: {folder}")
         ended_well = True
         return 0
     finally:

@@ -1,0 +1,158 @@
+"""Two real processes on this machine train as one would, and outlive each other's end."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import run_module
+
+from goalgan_bt import checkpoint, config, ranks
+from goalgan_bt.learner import Learner
+from goalgan_bt.train import make_env
+
+TWO = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+# A GAN amplifies rounding within a hundred steps: two show that it is given the same.
+SMALL = [
+    "--env",
+    "point_umaze",
+    "--viz",
+    "none",
+    "--threads",
+    "1",
+    "--updates",
+    "3",
+    "--rollout.num-envs",
+    "8",
+    "--coverage.rollouts",
+    "1",
+    "--gan.pretrain-steps",
+    "2",
+    "--gan.steps",
+    "2",
+    "--backtracking.min-transitions",
+    "50",
+]
+
+
+def start(*arguments, program=("-m", "goalgan_bt.train")):
+    words = [*TWO, *program, *map(str, arguments)]
+    return subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
+
+
+def saved(out):
+    (path,) = Path(out).glob("*/checkpoint.pt")
+    return torch.load(path, weights_only=True)
+
+
+def test_alone_nothing_is_reduced_or_shared():
+    x = torch.arange(3.0)
+    assert ranks.size() == 1 and ranks.rank() == 0 and ranks.speaks()
+    assert ranks.total(x) is x and torch.equal(ranks.mean(x), torch.arange(3.0))
+    rows = np.arange(4)
+    assert ranks.gather(rows) is rows and rows[ranks.share(4)].tolist() == [0, 1, 2, 3]
+    assert torch.equal(ranks.mine(x, 10), x) and ranks.any_of(True) and not ranks.any_of(False)
+
+
+CHECK = """
+import numpy as np, torch
+from goalgan_bt import ranks
+ranks.begin()
+r = ranks.rank()
+assert ranks.size() == ranks.here() == 2
+assert ranks.total(torch.full((2,), r + 1.0)).tolist() == [3.0, 3.0]
+assert ranks.total(torch.tensor(float(r)), beside=True).item() == 1.0
+assert ranks.mean(torch.tensor(float(r))).item() == 0.5
+assert ranks.gather(np.full((r + 1, 2), r)).tolist() == [[0, 0], [1, 1], [1, 1]]
+assert ranks.gather(np.zeros((0, 3), bool)).shape == (0, 3)
+assert ranks.gather(np.ones(r, bool)).tolist() == [True]
+assert np.arange(5)[ranks.share(5)].tolist() == [[0, 1], [2, 3, 4]][r]
+assert ranks.mine(torch.tensor([3, 0, 5, 2]), 3).tolist() == [[0, 2], [0, 2]][r]
+assert ranks.any_of(r == 1) and not ranks.any_of(False)
+x = torch.full((3,), float(r))
+ranks.agree([x])
+assert x.tolist() == [0.0] * 3
+ranks.end()
+"""
+
+
+def test_two_ranks_reduce_gather_and_share(tmp_path):
+    script = tmp_path / "check.py"
+    script.write_text(CHECK)
+    process = start(program=[script])
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 0, output
+
+
+def test_one_and_two_ranks_make_the_same_update(tmp_path):
+    """The same seed and batch: parameters differ by rounding only."""
+    steps = ("--iterations", 1, "--rollout.steps", 40)
+    code = run_module("train", *SMALL, *steps, "--out", tmp_path / "one").returncode
+    process = start(*SMALL, *steps, "--out", tmp_path / "two")
+    output, _ = process.communicate(timeout=120)
+    assert code == 0 and process.returncode == 0, output
+    assert output.count("run folder") == 1 and output.count("it 1 ") == 1  # one rank speaks
+    one, two = saved(tmp_path / "one"), saved(tmp_path / "two")
+    assert one["steps"]["train"] == two["steps"]["train"] == 4 * 8 * 40 * 4
+    for name in ("policy", "value", "generator", "discriminator"):
+        for key, mine in one["modules"][name].items():
+            assert torch.allclose(mine, two["modules"][name][key], atol=1e-3, rtol=1e-3), key
+    assert len(one["estimator_goals"]) > 0
+    assert torch.allclose(one["estimator_goals"], two["estimator_goals"], atol=1e-3)
+    assert torch.equal(one["estimator_success"], two["estimator_success"])
+    fresh = Learner(make_env(config.preset("point_umaze"), 1), config.preset("point_umaze"))
+    moved = (one["modules"]["policy"]["net.flat"] - fresh.policy.net.flat.detach()).abs().max()
+    apart = (one["modules"]["policy"]["net.flat"] - two["modules"]["policy"]["net.flat"]).abs()
+    assert apart.max() < 0.01 * moved
+
+
+@pytest.mark.parametrize("victim", [0, 1])
+def test_a_rank_that_dies_ends_the_run_with_a_usable_checkpoint(tmp_path, victim):
+    endless = [*SMALL, "--rollout.steps", 20, "--coverage.every", 1, "--out", tmp_path]
+    process = start(*endless, "--total-steps", 10**9)
+    deadline = time.monotonic() + 90
+    while not list(tmp_path.glob("*/checkpoint.pt")):
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.2)
+    os.kill(pid_of(victim, tmp_path), signal.SIGKILL)
+    output, _ = process.communicate(timeout=100)
+    assert process.returncode != 0
+    (line,) = [line for line in output.splitlines() if line.startswith("error: rank")]
+    assert line.startswith(f"error: rank {1 - victim}: a rank of this training is gone")
+    assert output.count("Traceback") == 1  # torchrun's own
+    (folder,) = tmp_path.iterdir()
+    if victim == 1:
+        assert f"--resume {folder}" in line
+    cfg = config.load(folder)
+    learner = Learner(make_env(cfg, 1), cfg)
+    checkpoint.load(learner, folder)
+    more = learner.steps["train"] + 3000
+    resumed = run_module("train", "--resume", folder, "--total-steps", more, "--viz", "none")
+    assert resumed.returncode == 0, resumed.stderr
+
+
+def pid_of(rank, out):
+    """The process of a rank that trains into a folder."""
+    for proc in Path("/proc").glob("[0-9]*"):
+        try:
+            command, environment = (proc / "cmdline").read_bytes(), (proc / "environ").read_bytes()
+        except OSError:
+            continue
+        if str(out).encode() in command and f"\0RANK={rank}\0".encode() in environment:
+            return int(proc.name)
+    raise AssertionError(f"no process of rank {rank}")
+
+
+def test_simulations_must_divide_among_the_ranks():
+    process = start(*SMALL, "--rollout.num-envs", 9, "--iterations", 1)
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode != 0
+    lines = [line for line in output.splitlines() if line.startswith("error:")]
+    assert lines == ["error: --rollout.num-envs must be a multiple of the 2 ranks, not 9"]
