@@ -4,15 +4,15 @@
 """
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from goalgan_bt.envs import maze as mazes
-from goalgan_bt.envs.ant_maze import AntMaze
-from goalgan_bt.envs.batch import GoalEnv
-from goalgan_bt.envs.point_maze import PointMaze
-from goalgan_bt.envs.point_nd import PointND
 
-BODIES = {"point": (PointMaze, 200), "ant": (AntMaze, 500)}  # horizon in the U-maze, steps
-NAMES = (*(f"{body}_{layout}" for body in BODIES for layout in mazes.LAYOUTS), "point_nd")
+if TYPE_CHECKING:
+    from goalgan_bt.envs.batch import GoalEnv
+
+HORIZON = {"point": 200, "ant": 500}  # steps of an episode in the U-maze
+NAMES = (*(f"{body}_{layout}" for body in HORIZON for layout in mazes.LAYOUTS), "point_nd")
 
 
 def make(
@@ -26,7 +26,7 @@ def make(
     dim: int = 2,
     map_file: Path | None = None,
     maze: mazes.Maze | None = None,
-) -> GoalEnv:
+) -> "GoalEnv":
     """N simulations of the environment of that name.
 
     Args:
@@ -47,17 +47,22 @@ def make(
     """
     if name not in NAMES:
         raise ValueError(f"unknown environment {name!r}: choose one of {', '.join(NAMES)}")
+    # Only now: MuJoCo takes half a second to import, and `--help` needs the names only.
+    from goalgan_bt.envs.ant_maze import AntMaze
+    from goalgan_bt.envs.point_maze import PointMaze
+    from goalgan_bt.envs.point_nd import PointND
+
     if name == "point_nd":
         if not 2 <= dim <= 6:
             raise ValueError(f"point_nd has 2 to 6 dimensions, not {dim}")
         return PointND(dim, num_envs, horizon or 200, action_repeat)
     body, layout = name.split("_")
-    constructor, base_horizon = BODIES[body]
+    constructor = {"point": PointMaze, "ant": AntMaze}[body]
     if maze is None:
         maze = mazes.layout(layout) if map_file is None else mazes.load(map_file)
     if horizon is None:
         scale = maze.longest_path / mazes.layout("umaze").longest_path
-        horizon = max(base_horizon, 100 * round(base_horizon * scale / 100))
+        horizon = max(HORIZON[body], 100 * round(HORIZON[body] * scale / 100))
     env = constructor(maze, num_envs, horizon, action_repeat, threads, integrator)
     env.name = name if map_file is None else f"{body}_{map_file.stem}"
     return env

@@ -8,7 +8,6 @@ body's physical state (positions and velocities), without the goal: physics does
 """
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -19,38 +18,12 @@ from torch import Tensor, nn
 from goalgan_bt.envs.batch import GoalEnv
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.mlp import MLP, RELU, TANH, Linearised
+from goalgan_bt.settings import BacktrackingConfig
 
 Float32 = NDArray[np.float32]
 
 
 LOG_VAR = (-10.0, 2.0)  # bounds of the learned log variance, normalised units
-
-
-@dataclass(frozen=True)
-class BacktrackingConfig:
-    """The backtracking model and its recall traces (Goyal et al. 2019)."""
-
-    trace_length: int = 20
-    """Length of a recall trace in environment steps (paper: 20 point, 50 ant); 0 is plain Goal
-    GAN. The model takes one backward step per action, `action_repeat` of them."""
-    traces: int = 200
-    """Recall traces per iteration, at most."""
-    hidden: tuple[int, ...] = (128, 128)
-    """Units of both networks' hidden layers (paper)."""
-    steps: int = 20
-    """Training steps per policy update (paper: 100 per 5 updates)."""
-    batch: int = 256
-    """Transitions per training step."""
-    learning_rate: float = 1e-3
-    """Step size of Adam."""
-    buffer: int = 100_000
-    """Transitions of successful episodes that are kept, newest first."""
-    min_transitions: int = 5_000
-    """No training and no traces before the buffer holds this many."""
-    max_shift: float = 0.5
-    """The decoder moves an experienced state by at most this much to a goal, metres."""
-    sample_actions: bool = True
-    """Sample a ~ q(a | s'), as in the paper; otherwise its mean."""
 
 
 class Transitions:

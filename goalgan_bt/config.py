@@ -1,4 +1,4 @@
-"""The settings of a run: one dataclass per concept, composed here, a preset per environment."""
+"""The settings of a run: those of each part, composed, and a preset per environment."""
 
 import json
 import math
@@ -10,17 +10,20 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from goalgan_bt import envs, ranks
-from goalgan_bt.backtracking import BacktrackingConfig
+from goalgan_bt import envs
 from goalgan_bt.command_line import UsageError, parse
-from goalgan_bt.coverage import CoverageConfig
-from goalgan_bt.gan import GanConfig
-from goalgan_bt.goals import GoalsConfig
-from goalgan_bt.imitation import ImitationConfig
-from goalgan_bt.policy import PolicyConfig, ValueConfig
 from goalgan_bt.record import write_atomically
-from goalgan_bt.rollout import RolloutConfig
-from goalgan_bt.trpo import TrpoConfig
+from goalgan_bt.settings import (
+    BacktrackingConfig,
+    CoverageConfig,
+    GanConfig,
+    GoalsConfig,
+    ImitationConfig,
+    PolicyConfig,
+    RolloutConfig,
+    TrpoConfig,
+    ValueConfig,
+)
 
 # What a resumed run must keep: another world or other randomness would be another run.
 FIXED = ("env", "seed", "map", "dim", "horizon", "action_repeat", "integrator", "out")
@@ -93,7 +96,8 @@ class Config:
     @property
     def num_threads(self) -> int:
         """Threads, with 0 resolved to this process's share of the cores that it may use."""
-        return self.threads or max(1, len(os.sched_getaffinity(0)) // ranks.here())
+        processes = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))  # torchrun's, on this machine
+        return self.threads or max(1, len(os.sched_getaffinity(0)) // processes)
 
 
 ANT = Config(

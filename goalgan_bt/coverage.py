@@ -6,7 +6,6 @@ training horizon and the training's definition of success.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -16,16 +15,6 @@ from goalgan_bt import ranks
 from goalgan_bt.envs.batch import GoalEnv, Ids, Step
 from goalgan_bt.envs.maze import FloatArray
 from goalgan_bt.policy import Actor, GaussianPolicy
-
-
-@dataclass(frozen=True)
-class CoverageConfig:
-    """How coverage is measured."""
-
-    rollouts: int = 3
-    """Episodes per test goal with the stochastic policy (the original: 2 point, 3 ant)."""
-    every: int = 1_500_000
-    """Training steps between two measurements; one more at the end."""
 
 
 class Success(NamedTuple):

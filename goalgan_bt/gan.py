@@ -8,38 +8,13 @@ with a = -1, b = 1 and c = 0 in the paper, c = b = 1 in the authors' code. Goals
 [-1, 1] over the goal box (the original's extra factor of 2 let samples land outside of it).
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.mlp import LEAKY_RELU, MLP, RELU, Linearised
-
-
-@dataclass(frozen=True)
-class GanConfig:
-    """The goal GAN (Florensa et al. 2018)."""
-
-    noise_dim: int = 4
-    """Size of z."""
-    generator_hidden: tuple[int, ...] = (256, 256)
-    """Units of the generator's hidden layers (relu)."""
-    discriminator_hidden: tuple[int, ...] = (128, 128)
-    """Units of the discriminator's hidden layers (leaky relu 0.1)."""
-    learning_rate: float = 1e-3
-    """Step size of RMSProp (decay 0.9), both networks."""
-    batch: int = 256
-    """Real goals, and as many generated ones, per step."""
-    steps: int = 60
-    """Training steps per iteration (the original: 250 to 300 of a smaller batch)."""
-    pretrain_steps: int = 100
-    """Training steps on what the fresh policy visits."""
-    generator_target: float = 1.0
-    """c, what the generator wants D to say: 1 in the original code, 0 in the paper."""
-    goal_noise: float = 0.3
-    """Standard deviation of the noise added to generated goals, metres (the original: 0.5)."""
+from goalgan_bt.settings import GanConfig
 
 
 class GoalGAN:

@@ -6,38 +6,10 @@ gives shares of 0, 1/2 or 1; the recent episodes to nearby goals estimate p inst
 (`SuccessEstimator`).
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from goalgan_bt.envs.maze import BoolArray, FloatArray
-
-
-@dataclass(frozen=True)
-class GoalsConfig:
-    """Labels and replay of goals."""
-
-    r_min: float = 0.1
-    """Goals reached less often are too hard (Florensa 2018)."""
-    r_max: float = 0.9
-    """Goals reached more often are mastered (Florensa 2018)."""
-    new: int = 200
-    """Goals from the GAN per iteration."""
-    old: int = 100
-    """Goals from the replay per iteration."""
-    labelled: int = 1000
-    """Further goals, uniform in the box, that the success estimator labels for the GAN."""
-    replay_distance: float = 0.3
-    """Replayed goals keep this distance from each other, metres."""
-    near: float = 0.4
-    """A goal farther than this from all places where the agent has been is too hard, metres (the
-    original: inf). Without it, walls around mastered places look intermediate."""
-    label_rollouts: int = 0
-    """Fresh episodes per goal for its label (the original: 3); 0 takes labels from training."""
-    episodes: int = 1000
-    """Recent training episodes from which success is estimated."""
-    neighbours: int = 10
-    """Episodes with the nearest goals whose successes are counted."""
+from goalgan_bt.settings import GoalsConfig
 
 
 def intermediate(success: FloatArray, r_min: float, r_max: float) -> BoolArray:

@@ -6,28 +6,13 @@ standard deviation. A bound on the KL from the policy as it was keeps imitation 
 trust-region step before it.
 """
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
 from goalgan_bt import ranks
 from goalgan_bt.mlp import Linearised
 from goalgan_bt.policy import GaussianPolicy, log_prob, mean_kl
-
-
-@dataclass(frozen=True)
-class ImitationConfig:
-    """Imitation of recall traces."""
-
-    steps: int = 20
-    """Gradient steps per iteration."""
-    batch: int = 512
-    """(state, action) pairs per step."""
-    learning_rate: float = 1e-4
-    """Step size of Adam, an optimiser of its own."""
-    max_kl: float = 0.005
-    """Imitation stops where the mean KL on the last rollouts passes this, nats."""
+from goalgan_bt.settings import ImitationConfig
 
 
 class Imitation:

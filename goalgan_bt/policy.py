@@ -5,7 +5,6 @@ free parameter. Observations already hold the desired goal, so both are goal-con
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -14,39 +13,7 @@ from torch import Tensor, nn
 
 from goalgan_bt import ranks
 from goalgan_bt.mlp import MLP, TANH, Linearised
-
-
-@dataclass(frozen=True)
-class PolicyConfig:
-    """The policy network."""
-
-    hidden: tuple[int, ...] = (128, 128)
-    """Units of the hidden layers (the original: 64 64)."""
-    input_gain: float = 1.0
-    """Scale of the first layer's first weights: more lets neighbouring places differ more."""
-    init_std: float = 0.6
-    """First standard deviation of the actions, in units of the action range [-1, 1]."""
-    min_std: float = 0.05
-    """The standard deviation never falls below this."""
-    final_std: float | None = None
-    """If given, the standard deviation is bounded by a line from init_std to this over the run;
-    once on the line it follows it."""
-
-
-@dataclass(frozen=True)
-class ValueConfig:
-    """The value function."""
-
-    hidden: tuple[int, ...] = (128, 128)
-    """Units of the hidden layers."""
-    input_gain: float = 1.0
-    """As the policy's."""
-    learning_rate: float = 1e-3
-    """Step size of Adam."""
-    epochs: int = 2
-    """Passes over the batch per update."""
-    minibatch: int = 2048
-    """Observations per gradient step."""
+from goalgan_bt.settings import PolicyConfig, ValueConfig
 
 
 class Normaliser(nn.Module):

@@ -67,11 +67,6 @@ def size() -> int:
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
-def here() -> int:
-    """How many of them run on this machine."""
-    return int(os.environ.get("LOCAL_WORLD_SIZE", "1")) if dist.is_initialized() else 1
-
-
 def total(x: Tensor, beside: bool = False) -> Tensor:
     """The sum over all ranks of a tensor, which is changed in place.
 

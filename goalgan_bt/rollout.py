@@ -20,22 +20,9 @@ from goalgan_bt import ranks
 from goalgan_bt.envs.batch import GoalEnv, Ids
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.policy import Actor, GaussianPolicy
+from goalgan_bt.settings import RolloutConfig
 
 Float32 = NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class RolloutConfig:
-    """Collection of experience."""
-
-    num_envs: int = 512
-    """Simulations side by side, in all processes together."""
-    steps: int = 100
-    """Actions in each simulation per policy update; the batch has num_envs * steps of them."""
-    chain: float = 0.5
-    """Chance that an episode that ended on its feet is followed by one from where it ended, with a
-    new goal, instead of one from the start (the original: 0). Only episodes from the start make
-    labels."""
 
 
 @dataclass

@@ -18,6 +18,10 @@ if __name__ == "__main__":
 
     signal.signal(signal.SIGINT, _leave)
     signal.signal(signal.SIGTERM, _leave)
+    if {"-h", "--help"} & set(sys.argv):
+        from goalgan_bt import config
+
+        config.from_command_line()  # ends here
 
 import errno
 import math

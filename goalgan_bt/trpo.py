@@ -6,7 +6,6 @@ search accepts the longest step whose surrogate rose and whose measured KL keeps
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -14,24 +13,7 @@ from torch import Tensor
 from goalgan_bt import ranks
 from goalgan_bt.mlp import CHUNK, Linearised
 from goalgan_bt.policy import GaussianPolicy, log_prob, mean_kl
-
-
-@dataclass(frozen=True)
-class TrpoConfig:
-    """Trust region policy optimisation (Schulman et al. 2015)."""
-
-    max_kl: float = 0.03
-    """Bound on the mean KL of one update, nats (the original: 0.01)."""
-    cg_iters: int = 10
-    """Conjugate gradient iterations."""
-    cg_damping: float = 0.01
-    """Added to the Fisher matrix's diagonal."""
-    fisher_fraction: float = 0.1
-    """Share of the batch on which Fisher-vector products are taken (the original: 1)."""
-    line_search_steps: int = 10
-    """Step lengths tried before the update is given up."""
-    line_search_decay: float = 0.7
-    """Factor between two step lengths."""
+from goalgan_bt.settings import TrpoConfig
 
 
 def conjugate_gradient(

@@ -1,0 +1,174 @@
+"""The settings of each part of the learner, which the file of the same name reads.
+
+They stand here together, apart from what reads them, so that the command line answers at once:
+importing the learner takes seconds.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """The policy network."""
+
+    hidden: tuple[int, ...] = (128, 128)
+    """Units of the hidden layers (the original: 64 64)."""
+    input_gain: float = 1.0
+    """Scale of the first layer's first weights: more lets neighbouring places differ more."""
+    init_std: float = 0.6
+    """First standard deviation of the actions, in units of the action range [-1, 1]."""
+    min_std: float = 0.05
+    """The standard deviation never falls below this."""
+    final_std: float | None = None
+    """If given, the standard deviation is bounded by a line from init_std to this over the run;
+    once on the line it follows it."""
+
+
+@dataclass(frozen=True)
+class ValueConfig:
+    """The value function."""
+
+    hidden: tuple[int, ...] = (128, 128)
+    """Units of the hidden layers."""
+    input_gain: float = 1.0
+    """As the policy's."""
+    learning_rate: float = 1e-3
+    """Step size of Adam."""
+    epochs: int = 2
+    """Passes over the batch per update."""
+    minibatch: int = 2048
+    """Observations per gradient step."""
+
+
+@dataclass(frozen=True)
+class RolloutConfig:
+    """Collection of experience."""
+
+    num_envs: int = 512
+    """Simulations side by side, in all processes together."""
+    steps: int = 100
+    """Actions in each simulation per policy update; the batch has num_envs * steps of them."""
+    chain: float = 0.5
+    """Chance that an episode that ended on its feet is followed by one from where it ended, with a
+    new goal, instead of one from the start (the original: 0). Only episodes from the start make
+    labels."""
+
+
+@dataclass(frozen=True)
+class GoalsConfig:
+    """Labels and replay of goals."""
+
+    r_min: float = 0.1
+    """Goals reached less often are too hard (Florensa 2018)."""
+    r_max: float = 0.9
+    """Goals reached more often are mastered (Florensa 2018)."""
+    new: int = 200
+    """Goals from the GAN per iteration."""
+    old: int = 100
+    """Goals from the replay per iteration."""
+    labelled: int = 1000
+    """Further goals, uniform in the box, that the success estimator labels for the GAN."""
+    replay_distance: float = 0.3
+    """Replayed goals keep this distance from each other, metres."""
+    near: float = 0.4
+    """A goal farther than this from all places where the agent has been is too hard, metres (the
+    original: inf). Without it, walls around mastered places look intermediate."""
+    label_rollouts: int = 0
+    """Fresh episodes per goal for its label (the original: 3); 0 takes labels from training."""
+    episodes: int = 1000
+    """Recent training episodes from which success is estimated."""
+    neighbours: int = 10
+    """Episodes with the nearest goals whose successes are counted."""
+
+
+@dataclass(frozen=True)
+class GanConfig:
+    """The goal GAN (Florensa et al. 2018)."""
+
+    noise_dim: int = 4
+    """Size of z."""
+    generator_hidden: tuple[int, ...] = (256, 256)
+    """Units of the generator's hidden layers (relu)."""
+    discriminator_hidden: tuple[int, ...] = (128, 128)
+    """Units of the discriminator's hidden layers (leaky relu 0.1)."""
+    learning_rate: float = 1e-3
+    """Step size of RMSProp (decay 0.9), both networks."""
+    batch: int = 256
+    """Real goals, and as many generated ones, per step."""
+    steps: int = 60
+    """Training steps per iteration (the original: 250 to 300 of a smaller batch)."""
+    pretrain_steps: int = 100
+    """Training steps on what the fresh policy visits."""
+    generator_target: float = 1.0
+    """c, what the generator wants D to say: 1 in the original code, 0 in the paper."""
+    goal_noise: float = 0.3
+    """Standard deviation of the noise added to generated goals, metres (the original: 0.5)."""
+
+
+@dataclass(frozen=True)
+class TrpoConfig:
+    """Trust region policy optimisation (Schulman et al. 2015)."""
+
+    max_kl: float = 0.03
+    """Bound on the mean KL of one update, nats (the original: 0.01)."""
+    cg_iters: int = 10
+    """Conjugate gradient iterations."""
+    cg_damping: float = 0.01
+    """Added to the Fisher matrix's diagonal."""
+    fisher_fraction: float = 0.1
+    """Share of the batch on which Fisher-vector products are taken (the original: 1)."""
+    line_search_steps: int = 10
+    """Step lengths tried before the update is given up."""
+    line_search_decay: float = 0.7
+    """Factor between two step lengths."""
+
+
+@dataclass(frozen=True)
+class BacktrackingConfig:
+    """The backtracking model and its recall traces (Goyal et al. 2019)."""
+
+    trace_length: int = 20
+    """Length of a recall trace in environment steps (paper: 20 point, 50 ant); 0 is plain Goal
+    GAN. The model takes one backward step per action, `action_repeat` of them."""
+    traces: int = 200
+    """Recall traces per iteration, at most."""
+    hidden: tuple[int, ...] = (128, 128)
+    """Units of both networks' hidden layers (paper)."""
+    steps: int = 20
+    """Training steps per policy update (paper: 100 per 5 updates)."""
+    batch: int = 256
+    """Transitions per training step."""
+    learning_rate: float = 1e-3
+    """Step size of Adam."""
+    buffer: int = 100_000
+    """Transitions of successful episodes that are kept, newest first."""
+    min_transitions: int = 5_000
+    """No training and no traces before the buffer holds this many."""
+    max_shift: float = 0.5
+    """The decoder moves an experienced state by at most this much to a goal, metres."""
+    sample_actions: bool = True
+    """Sample a ~ q(a | s'), as in the paper; otherwise its mean."""
+
+
+@dataclass(frozen=True)
+class ImitationConfig:
+    """Imitation of recall traces."""
+
+    steps: int = 20
+    """Gradient steps per iteration."""
+    batch: int = 512
+    """(state, action) pairs per step."""
+    learning_rate: float = 1e-4
+    """Step size of Adam, an optimiser of its own."""
+    max_kl: float = 0.005
+    """Imitation stops where the mean KL on the last rollouts passes this, nats."""
+
+
+@dataclass(frozen=True)
+class CoverageConfig:
+    """How coverage is measured."""
+
+    rollouts: int = 3
+    """Episodes per test goal with the stochastic policy (the original: 2 point, 3 ant)."""
+    every: int = 1_500_000
+    """Training steps between two measurements; one more at the end."""
