@@ -17,10 +17,15 @@ class Unavailable(Exception):
 
 
 class Sample(NamedTuple):
-    """One measurement: environment steps taken, wall seconds spent, seconds simulated by a step."""
+    """One measurement.
+
+    steps: environment steps taken; seconds: wall time spent; cpu: processor time spent, seconds;
+    dt: seconds that a step simulates.
+    """
 
     steps: int
     seconds: float
+    cpu: float
     dt: float
 
 
@@ -29,15 +34,15 @@ def clocked(step: Callable[[], int], durations: Iterable[float], dt: float) -> I
 
     Args:
         step: does some of the work and returns how many environment steps it took.
-        durations: seconds; work that has begun is finished and counts in full.
+        durations: seconds; at least one step is taken, and the last one is finished.
         dt: seconds that one environment step simulates.
     """
     for duration in durations:
-        steps, spent, begin = 0, 0.0, time.perf_counter()
-        while spent < duration:
+        steps, spent, cpu, begin = 0, 0.0, cpu_seconds(), time.perf_counter()
+        while not steps or spent < duration:
             steps += step()
             spent = time.perf_counter() - begin
-        yield Sample(steps, spent, dt)
+        yield Sample(steps, spent, cpu_seconds() - cpu, dt)
 
 
 def cpu_seconds() -> float:

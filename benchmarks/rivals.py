@@ -202,7 +202,7 @@ def gymnasium_robotics(
 
 def robotics_env(body: str, our_physics: bool) -> gymnasium.Env[Any, Any]:
     """gymnasium-robotics' U-maze for `ant` or `point`."""
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints a notice
+    with contextlib.redirect_stderr(io.StringIO()):  # it prints a notice
         import gymnasium_robotics
     gymnasium.register_envs(gymnasium_robotics)
     env = gymnasium.make(ROBOTICS[body])

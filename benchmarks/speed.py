@@ -26,9 +26,9 @@ import contextlib
 import io
 import itertools
 import json
+import multiprocessing
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -39,7 +39,7 @@ import numpy as np
 import rivals
 import torch
 import tyro
-from common import Sample, Unavailable, clocked, cores, cpu_seconds, machine
+from common import Sample, Unavailable, clocked, cores, machine
 
 from goalgan_bt import config
 from goalgan_bt.config import Config
@@ -81,14 +81,6 @@ class Measurement:
     threads: int
     samples: Iterator[Sample]
     taken: list[Sample] = field(default_factory=list)
-    cpu: list[float] = field(default_factory=list)  # CPU time per wall time of each sample
-
-    def take(self) -> None:
-        """Measure once."""
-        wall, cpu = time.perf_counter(), cpu_seconds()
-        sample = next(self.samples)
-        self.cpu.append((cpu_seconds() - cpu) / (time.perf_counter() - wall))
-        self.taken.append(sample)
 
     def speeds(self) -> list[float]:
         """Environment steps per second of each sample."""
@@ -131,15 +123,15 @@ def collection(cfg: Config, durations: Iterable[float]) -> Iterator[Sample]:
 def training(cfg: Config, durations: Iterable[float], total_steps: int) -> Iterator[Sample]:
     """Whole runs, from building the environment to the last evaluation; the first, as a warm-up,
     of one iteration. The durations are not heeded."""
-    dt = make_env(cfg, 1).dt
-    for limit, _ in zip(
-        itertools.chain([1], itertools.repeat(total_steps)), durations, strict=False
-    ):
-        with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
-            begin = time.perf_counter()
-            steps = train(replace(cfg, total_steps=limit), Path(folder)).steps
-            spent = time.perf_counter() - begin
-        yield Sample(steps, spent, dt)
+    limits = itertools.chain([1], itertools.repeat(total_steps))
+
+    def run() -> int:
+        quiet = contextlib.redirect_stdout(io.StringIO())
+        with tempfile.TemporaryDirectory() as folder, quiet:
+            return train(replace(cfg, total_steps=next(limits)), Path(folder)).steps
+
+    once = (0.0 for _ in durations)
+    return clocked(run, once, make_env(cfg, 1).dt)
 
 
 Kind = Callable[[Config, Iterable[float]], Iterator[Sample]]
@@ -213,15 +205,19 @@ def rows_of(measured: list[Measurement]) -> list[dict[str, Any]]:
                 "steps_per_second": round(middle),
                 "range": [round(min(speeds)), round(max(speeds))],
                 "sim_seconds_per_second": round(middle * m.taken[0].dt, 1),
-                "cores_busy": round(float(np.median(m.cpu)), 2),
+                "cores_busy": round(
+                    float(np.median([sample.cpu / sample.seconds for sample in m.taken])), 2
+                ),
             }
         )
     for row in rows:
         same = [other for other in rows if other["env"] == row["env"]]
         peers = [other for other in same if other["threads"] == row["threads"]]
         shipped = [other for other in same if other["name"] == "gymnasium_robotics"]
+        alone = [o for o in same if (o["name"], o["threads"]) == (row["name"], 1)]
         raw = [other for other in peers if other["name"] == "raw_batch"]
         sb3 = [other for other in peers if other["name"].startswith("sb3_contrib_trpo")]
+        row["factor_over_one_thread"] = factor(row, alone)
         row["share_of_raw"] = factor(row, raw)
         row["factor_over_sb3"] = factor(row, sb3)
         row["factor_over_robotics"] = factor(row, shipped)
@@ -246,6 +242,7 @@ COLUMNS = {  # heading: key of a row
     "range": "range",
     "simulated s/s": "sim_seconds_per_second",
     "cores": "cores_busy",
+    "x 1 thread": "factor_over_one_thread",
     "of raw": "share_of_raw",
     "x sb3": "factor_over_sb3",
     "x robotics": "factor_over_robotics",
@@ -278,10 +275,12 @@ def cell(value: Any) -> str:
 def main() -> None:
     settings = tyro.cli(Settings, description=__doc__)
     print(machine(), flush=True)
+    # Once for all of the processes to come, or else each of them takes seconds to begin.
+    multiprocessing.set_forkserver_preload(["goalgan_bt.train", "stable_baselines3"])
     ready = warm_up(measurements(settings))
     for number in range(settings.rounds):
         for measurement in ready:
-            measurement.take()
+            measurement.taken.append(next(measurement.samples))
         print(f"round {number + 1} of {settings.rounds}", file=sys.stderr, flush=True)
     rows = rows_of(ready)
     print(table(rows))
