@@ -16,7 +16,7 @@ step and integrator. `envpool` is EnvPool's Ant (no maze) or PointMaze with rand
 
 After one warm-up each, every round takes one sample of everything, all environments and numbers of
 threads. The table gives medians and ranges; factors are over the fastest row of sb3-contrib for
-the same environment and threads, and over gymnasium-robotics as shipped. A step of ours and of
+the same environment with as many threads or fewer, and over gymnasium-robotics as shipped. A step of ours and of
 sb3-contrib simulates 0.02 s; where a step is longer or shorter, compare `simulated s/s`. `threads`
 are the simulation's, for sb3-contrib torch's; what learns beside may keep another core busy, as
 `cores` tells: CPU time per wall time.
@@ -183,12 +183,20 @@ def warm_up(planned: list[Measurement]) -> list[Measurement]:
     ready = []
     for measurement in planned:
         try:
-            next(measurement.samples)
+            tell("warm-up", measurement, next(measurement.samples))
         except (ImportError, Unavailable) as error:
             print(f"no {measurement.name} for {measurement.env}: {error}", flush=True)
         else:
             ready.append(measurement)
     return ready
+
+
+def tell(when: str, of: Measurement, sample: Sample) -> None:
+    """Say on standard error how it goes."""
+    speed = f"{sample.steps / sample.seconds:,.0f} steps/s"
+    print(
+        f"{when}: {of.env}, {of.threads} threads, {of.name}: {speed}", file=sys.stderr, flush=True
+    )
 
 
 def rows_of(measured: list[Measurement]) -> list[dict[str, Any]]:
@@ -216,7 +224,8 @@ def rows_of(measured: list[Measurement]) -> list[dict[str, Any]]:
         shipped = [other for other in same if other["name"] == "gymnasium_robotics"]
         alone = [o for o in same if (o["name"], o["threads"]) == (row["name"], 1)]
         raw = [other for other in peers if other["name"] == "raw_batch"]
-        sb3 = [other for other in peers if other["name"].startswith("sb3_contrib_trpo")]
+        # Torch's threads may cost more than they bring: sb3-contrib need not use all that we do.
+        sb3 = [o for o in same if o["name"].startswith("sb3") and o["threads"] <= row["threads"]]
         row["factor_over_one_thread"] = factor(row, alone)
         row["share_of_raw"] = factor(row, raw)
         row["factor_over_sb3"] = factor(row, sb3)
@@ -281,7 +290,7 @@ def main() -> None:
     for number in range(settings.rounds):
         for measurement in ready:
             measurement.taken.append(next(measurement.samples))
-        print(f"round {number + 1} of {settings.rounds}", file=sys.stderr, flush=True)
+            tell(f"round {number + 1}", measurement, measurement.taken[-1])
     rows = rows_of(ready)
     print(table(rows))
     if settings.json is not None:
