@@ -15,11 +15,11 @@ repeat. `gymnasium_robotics` is its own U-maze with random actions, as shipped a
 step and integrator. `envpool` is EnvPool's Ant (no maze) or PointMaze with random actions.
 
 After one warm-up each, every round takes one sample of everything, all environments and numbers of
-threads. The table gives medians and ranges; factors are over the fastest row of sb3-contrib for
-the same environment with as many threads or fewer, and over gymnasium-robotics as shipped. A step of ours and of
-sb3-contrib simulates 0.02 s; where a step is longer or shorter, compare `simulated s/s`. `threads`
-are the simulation's, for sb3-contrib torch's; what learns beside may keep another core busy, as
-`cores` tells: CPU time per wall time.
+threads. The table gives medians and ranges. Factors are over the fastest row of sb3-contrib for the
+same environment with as many threads or fewer, and over gymnasium-robotics as shipped. A step of
+ours and of sb3-contrib simulates 0.02 s; where it is longer or shorter, compare `simulated s/s`.
+`threads` are the simulation's, for sb3-contrib torch's; what learns beside may keep another core
+busy, as `cores` tells: CPU time per wall time. Run it on an idle machine.
 """
 
 import contextlib
@@ -65,7 +65,8 @@ class Settings:
     only: tuple[str, ...] = ()
     """Measurements to take, by name; if none is given, all."""
     num_envs: int | None = None
-    """Simulations side by side; if None, as the preset has it."""
+    """Simulations side by side; if None, as the preset has it. Where sb3-contrib has 8 of them, it
+    gets no more than this."""
     sb3_steps: int = 2048
     """Actions per simulation and iteration of sb3-contrib's TRPO, with 8 simulations."""
     json: Path | None = None
@@ -139,8 +140,8 @@ Kind = Callable[[Config, Iterable[float]], Iterator[Sample]]
 
 def kinds(settings: Settings) -> dict[str, Kind]:
     """What can be measured, by name."""
-    sb3 = partial(rivals.sb3_contrib_trpo, vector="DummyVecEnv", num_envs=8)
-    sb3 = partial(sb3, n_steps=settings.sb3_steps)
+    sb3 = partial(rivals.sb3_contrib_trpo, vector="DummyVecEnv", n_steps=settings.sb3_steps)
+    sb3 = partial(sb3, num_envs=min(8, settings.num_envs or 8))
     return {
         "raw_batch": raw_batch,
         "collection": collection,

@@ -43,7 +43,7 @@ def run(script, *words):
 def test_one_command_measures_everything(tmp_path):
     file = tmp_path / "speed.json"
     tiny = "--env point_umaze --threads 1 --rounds 1 --seconds 0.05 --train-steps 1"
-    tiny += " --num-envs 4 --sb3-steps 16 --json"
+    tiny += " --num-envs 2 --sb3-steps 16 --json"
     printed = run("speed.py", *tiny.split(), file)
     rows = {row["name"]: row for row in json.loads(file.read_text())}
     assert set(rows) == NAMES | ({"envpool"} if find_spec("envpool") else set())
