@@ -1,26 +1,47 @@
-"""Environment steps per second: the raw simulator, collection, and whole training, in one run.
+"""Environment steps per second: ours and others', in one run and one table.
 
-    python benchmarks/speed.py --env ant_umaze --threads 2
+    python benchmarks/speed.py                            # all of it
+    python benchmarks/speed.py --threads 1 2 4 8 16       # how it scales
+    python benchmarks/speed.py --env ant_umaze --only raw_batch collection training
 
-`raw_batch` is `mujoco.batch.Batch.step` on the same model with random controls and nothing else:
-the physical limit. `collection` adds the policy, goals, resets and observations. `training` is
-everything: learning, labels, GAN, backtracking, imitation, evaluation, recording. The three
-alternate for some rounds after a warm-up; the table gives medians and ranges.
+Ours: `raw_batch` is `mujoco.batch.Batch.step` on the same model with random controls and nothing
+else, the physical limit. `collection` adds the policy, goals, resets and observations. `training`
+is a whole run of the default preset: learning, labels, GAN, backtracking, imitation, evaluation,
+recording.
+
+Others' (rivals.py), for which the extra `bench` is needed: `sb3_contrib_trpo` trains on the same
+task and physics, with 8 simulations in turn, with 32, with 8 in processes, and without our action
+repeat. `gymnasium_robotics` is its own U-maze with random actions, as shipped and with our time
+step and integrator. `envpool` is EnvPool's Ant (no maze) or PointMaze with random actions.
+
+After one warm-up each, every round takes one sample of everything, all environments and numbers of
+threads. The table gives medians and ranges. Factors are over the fastest row of sb3-contrib for the
+same environment with as many threads or fewer, and over gymnasium-robotics as shipped. A step of
+ours and of sb3-contrib simulates 0.02 s; where it is longer or shorter, compare `simulated s/s`.
+`threads` are the simulation's, for sb3-contrib torch's; what learns beside may keep another core
+busy, as `cores` tells: CPU time per wall time. Run it on an idle machine.
 """
 
+import contextlib
+import io
+import itertools
 import json
-import platform
+import multiprocessing
+import sys
 import tempfile
-import time
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-import mujoco
 import numpy as np
+import rivals
 import torch
 import tyro
+from common import Sample, Unavailable, clocked, cores, machine
 
-from goalgan_bt import config, record
+from goalgan_bt import config
 from goalgan_bt.config import Config
 from goalgan_bt.learner import Learner
 from goalgan_bt.rollout import Collector
@@ -31,92 +52,248 @@ from goalgan_bt.train import make_env, train
 class Settings:
     """Measure environment steps per second."""
 
-    env: tuple[str, ...] = ("ant_umaze", "point_umaze")
-    """Environments."""
-    threads: tuple[int, ...] = (2,)
+    env: tuple[str, ...] = ("point_umaze", "ant_umaze")
+    """Environments: mazes of the point and the Ant."""
+    threads: tuple[int, ...] = tuple(sorted({1, min(2, cores())}))
     """Numbers of threads."""
     rounds: int = 3
-    """Alternations of the three measurements."""
+    """Samples of each measurement, after its warm-up."""
     seconds: float = 4.0
-    """Duration of each raw and collection measurement."""
+    """Duration of a sample, except of training; what has begun is finished."""
     train_steps: int = 3_000_000
-    """Environment steps of each training run."""
+    """Environment steps of a training run."""
+    only: tuple[str, ...] = ()
+    """Measurements to take, by name; if none is given, all."""
+    num_envs: int | None = None
+    """Simulations side by side; if None, as the preset has it. Where sb3-contrib has 8 of them, it
+    gets no more than this."""
+    sb3_steps: int = 2048
+    """Actions per simulation and iteration of sb3-contrib's TRPO, with 8 simulations."""
     json: Path | None = None
     """Also write the rows to this file."""
 
 
-def raw_batch(cfg: Config, seconds: float) -> float:
-    """Steps/s of the simulator alone: random controls, back to the start every 100 steps."""
-    env = make_env(cfg, cfg.rollout.num_envs)
+@dataclass
+class Measurement:
+    """One row of the table as it grows."""
+
+    name: str
+    env: str
+    threads: int
+    samples: Iterator[Sample]
+    taken: list[Sample] = field(default_factory=list)
+
+    def speeds(self) -> list[float]:
+        """Environment steps per second of each sample."""
+        return [sample.steps / sample.seconds for sample in self.taken]
+
+
+def raw_batch(cfg: Config, durations: Iterable[float]) -> Iterator[Sample]:
+    """The simulator alone: random controls, back to the start every 100 steps."""
+    env: Any = make_env(cfg, cfg.rollout.num_envs)
     ids = np.arange(env.num_envs)
     controls = np.random.default_rng(0).uniform(-1, 1, (16, env.num_envs, env.act_dim))
     ctrl = env.batch.bind("ctrl")
-    steps, begin = 0, time.perf_counter()
-    while time.perf_counter() - begin < seconds:
+
+    def episode() -> int:
         env.reset(ids, env.goals)
         for i in range(100):
             ctrl[:] = controls[i % 16]
             env.batch.step()
-        steps += 100
-    return steps * env.num_envs / (time.perf_counter() - begin)
+        return 100 * env.num_envs
+
+    return clocked(episode, durations, env.dt)
 
 
-def collection(cfg: Config, seconds: float) -> float:
-    """Steps/s of rollouts with a fresh policy."""
+def collection(cfg: Config, durations: Iterable[float]) -> Iterator[Sample]:
+    """Rollouts with a fresh policy."""
     env = make_env(cfg, cfg.rollout.num_envs)
     learner = Learner(env, cfg)
     collector = Collector(env, cfg.rollout, learner.rng, learner.noise["rollout"])
     goals = learner.gan.sample(300)
     collector.begin(goals)
-    steps, begin = 0, time.perf_counter()
-    while time.perf_counter() - begin < seconds:
+
+    def batch() -> int:
+        torch.set_num_threads(cfg.learning_threads)
         rollouts, _ = collector.collect(learner.policy, goals)
-        steps += rollouts.rewards.size * cfg.action_repeat
-    return steps / (time.perf_counter() - begin)
+        return rollouts.rewards.size * cfg.action_repeat
+
+    return clocked(batch, durations, env.dt)
 
 
-def training(cfg: Config, total_steps: int) -> float:
-    """Training steps/s of a whole run from its first step to its last, evaluation included."""
-    with tempfile.TemporaryDirectory() as folder:
-        train(replace(cfg, total_steps=total_steps), Path(folder))
-        _, rows = record.read_metrics(Path(folder))
-    return float(rows[-1]["time/fps"])
+def training(cfg: Config, durations: Iterable[float], total_steps: int) -> Iterator[Sample]:
+    """Whole runs, from building the environment to the last evaluation; the first, as a warm-up,
+    of one iteration. The durations are not heeded."""
+    limits = itertools.chain([1], itertools.repeat(total_steps))
+
+    def run() -> int:
+        quiet = contextlib.redirect_stdout(io.StringIO())
+        with tempfile.TemporaryDirectory() as folder, quiet:
+            return train(replace(cfg, total_steps=next(limits)), Path(folder)).steps
+
+    once = (0.0 for _ in durations)
+    return clocked(run, once, make_env(cfg, 1).dt)
+
+
+Kind = Callable[[Config, Iterable[float]], Iterator[Sample]]
+
+
+def kinds(settings: Settings) -> dict[str, Kind]:
+    """What can be measured, by name."""
+    sb3 = partial(rivals.sb3_contrib_trpo, vector="DummyVecEnv", n_steps=settings.sb3_steps)
+    sb3 = partial(sb3, num_envs=min(8, settings.num_envs or 8))
+    return {
+        "raw_batch": raw_batch,
+        "collection": collection,
+        "training": partial(training, total_steps=settings.train_steps),
+        # Data-parallel training (`ranks_2x1`, ...) goes here.
+        "sb3_contrib_trpo": sb3,
+        "sb3_contrib_trpo_32": partial(sb3, num_envs=32, n_steps=max(1, settings.sb3_steps // 4)),
+        "sb3_contrib_trpo_subproc": partial(sb3, vector="SubprocVecEnv"),
+        "sb3_contrib_trpo_no_repeat": lambda cfg, durations: sb3(
+            replace(cfg, action_repeat=1), durations
+        ),
+        "gymnasium_robotics": partial(rivals.gymnasium_robotics, our_physics=False),
+        "gymnasium_robotics_our_physics": partial(rivals.gymnasium_robotics, our_physics=True),
+        "envpool": rivals.envpool,
+    }
+
+
+def measurements(settings: Settings) -> list[Measurement]:
+    """Everything that shall be measured, not yet begun."""
+    known = kinds(settings)
+    if unknown := set(settings.only) - set(known):
+        sys.exit(f"no measurement is called {', '.join(sorted(unknown))}: {', '.join(known)}")
+    found = []
+    for env, (name, kind) in itertools.product(settings.env, known.items()):
+        one_thread = name.startswith("gymnasium_robotics")
+        for threads in (1,) if one_thread else settings.threads:
+            if settings.only and name not in settings.only:
+                continue
+            cfg = replace(config.preset(env), threads=threads)
+            if settings.num_envs is not None:
+                cfg = replace(cfg, rollout=replace(cfg.rollout, num_envs=settings.num_envs))
+            warm_up = min(1.0, settings.seconds)
+            durations = itertools.chain([warm_up], itertools.repeat(settings.seconds))
+            found.append(Measurement(name, env, threads, kind(cfg, durations)))
+    return found
+
+
+def warm_up(planned: list[Measurement]) -> list[Measurement]:
+    """Take a sample of each that does not count; leave out what cannot be had here."""
+    ready = []
+    for measurement in planned:
+        try:
+            tell("warm-up", measurement, next(measurement.samples))
+        except (ImportError, Unavailable) as error:
+            print(f"no {measurement.name} for {measurement.env}: {error}", flush=True)
+        else:
+            ready.append(measurement)
+    return ready
+
+
+def tell(when: str, of: Measurement, sample: Sample) -> None:
+    """Say on standard error how it goes."""
+    speed = f"{sample.steps / sample.seconds:,.0f} steps/s"
+    print(
+        f"{when}: {of.env}, {of.threads} threads, {of.name}: {speed}", file=sys.stderr, flush=True
+    )
+
+
+def rows_of(measured: list[Measurement]) -> list[dict[str, Any]]:
+    """The table as plain values: medians over the rounds, and what they are compared with."""
+    where, rows = machine(), []
+    for m in measured:
+        speeds = m.speeds()
+        middle = float(np.median(speeds))
+        rows.append(
+            {
+                "name": m.name,
+                "env": m.env,
+                "threads": m.threads,
+                "steps_per_second": round(middle),
+                "range": [round(min(speeds)), round(max(speeds))],
+                "sim_seconds_per_second": round(middle * m.taken[0].dt, 1),
+                "cores_busy": round(
+                    float(np.median([sample.cpu / sample.seconds for sample in m.taken])), 2
+                ),
+            }
+        )
+    for row in rows:
+        same = [other for other in rows if other["env"] == row["env"]]
+        peers = [other for other in same if other["threads"] == row["threads"]]
+        shipped = [other for other in same if other["name"] == "gymnasium_robotics"]
+        alone = [o for o in same if (o["name"], o["threads"]) == (row["name"], 1)]
+        raw = [other for other in peers if other["name"] == "raw_batch"]
+        # Torch's threads may cost more than they bring: sb3-contrib need not use all that we do.
+        sb3 = [o for o in same if o["name"].startswith("sb3") and o["threads"] <= row["threads"]]
+        row["factor_over_one_thread"] = factor(row, alone)
+        row["share_of_raw"] = factor(row, raw)
+        row["factor_over_sb3"] = factor(row, sb3)
+        row["factor_over_robotics"] = factor(row, shipped)
+        row["factor_over_robotics_simulated"] = factor(row, shipped, "sim_seconds_per_second")
+        row["rounds"], row["machine"] = len(measured[0].taken), where
+    return rows
+
+
+def factor(
+    row: dict[str, Any], others: list[dict[str, Any]], key: str = "steps_per_second"
+) -> float | None:
+    """How many times as fast a row is as the fastest of others; None if there are no others."""
+    fastest = max((other[key] for other in others), default=0)
+    return float(f"{row[key] / fastest:.3g}") if fastest else None
+
+
+COLUMNS = {  # heading: key of a row
+    "environment": "env",
+    "threads": "threads",
+    "what": "name",
+    "steps/s": "steps_per_second",
+    "range": "range",
+    "simulated s/s": "sim_seconds_per_second",
+    "cores": "cores_busy",
+    "x 1 thread": "factor_over_one_thread",
+    "of raw": "share_of_raw",
+    "x sb3": "factor_over_sb3",
+    "x robotics": "factor_over_robotics",
+    "x robotics, simulated": "factor_over_robotics_simulated",
+}
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """The rows as Markdown, by environment and threads."""
+    lines = [list(COLUMNS)]
+    for row in sorted(rows, key=lambda row: (row["env"], row["threads"])):  # keeps their order else
+        lines.append([cell(row[key]) for key in COLUMNS.values()])
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    lines.insert(1, ["-" * width for width in widths])
+    return "\n".join(
+        f"| {' | '.join(text.ljust(n) for text, n in zip(line, widths, strict=True))} |"
+        for line in lines
+    )
+
+
+def cell(value: Any) -> str:
+    """A value of a row as a person reads it."""
+    if value is None:
+        return ""
+    if isinstance(value, list):
+        return " to ".join(f"{x:,}" for x in value)
+    return f"{value:,}" if isinstance(value, int | float) else str(value)
 
 
 def main() -> None:
     settings = tyro.cli(Settings, description=__doc__)
-    versions = f"mujoco {mujoco.__version__}, torch {torch.__version__}"
-    print(f"{platform.processor() or platform.machine()}, {versions}")
-    rows = []
-    for env in settings.env:
-        for threads in settings.threads:
-            cfg = replace(config.preset(env), threads=threads)
-            torch.set_num_threads(cfg.learning_threads)
-            raw_batch(cfg, 1.0)  # warm-up
-            collection(cfg, 1.0)
-            measured: dict[str, list[float]] = {"raw_batch": [], "collection": [], "training": []}
-            for _ in range(settings.rounds):
-                measured["raw_batch"].append(raw_batch(cfg, settings.seconds))
-                measured["collection"].append(collection(cfg, settings.seconds))
-                measured["training"].append(training(cfg, settings.train_steps))
-            limit = np.median(measured["raw_batch"])
-            for name, values in measured.items():
-                middle = float(np.median(values))
-                rows.append(
-                    {
-                        "name": name,
-                        "env": env,
-                        "threads": threads,
-                        "steps_per_second": round(middle),
-                        "range": [round(min(values)), round(max(values))],
-                        "share_of_raw": round(middle / limit, 3),
-                    }
-                )
-                print(
-                    f"{env:12} {threads} threads  {name:10} {middle:>9,.0f} steps/s  "
-                    f"({min(values):,.0f} to {max(values):,.0f})  {middle / limit:.2f} of raw",
-                    flush=True,
-                )
+    print(machine(), flush=True)
+    # Once for all of the processes to come, or else each of them takes seconds to begin.
+    multiprocessing.set_forkserver_preload(["goalgan_bt.train", "stable_baselines3"])
+    ready = warm_up(measurements(settings))
+    for number in range(settings.rounds):
+        for measurement in ready:
+            measurement.taken.append(next(measurement.samples))
+            tell(f"round {number + 1}", measurement, measurement.taken[-1])
+    rows = rows_of(ready)
+    print(table(rows))
     if settings.json is not None:
         settings.json.write_text(json.dumps(rows, indent=2) + "\n")
 
