@@ -45,7 +45,7 @@ PHASES = {
         "goalgan_bt.envs.point_maze:PointMaze.observations",
         "goalgan_bt.envs.point_nd:PointND.observations",
     ),
-    "policy inference": ("goalgan_bt.policy:GaussianPolicy.act",),
+    "policy inference": ("goalgan_bt.policy:Actor.__call__",),
     "bookkeeping of rollouts": ("goalgan_bt.rollout:Collector.collect",),
     "advantages": ("goalgan_bt.train:advantages_and_returns",),
     "TRPO": ("goalgan_bt.trpo:update",),

@@ -106,11 +106,10 @@ ANT = Config(
     action_repeat=2,
     discount=0.993,
     updates=4,
-    policy=PolicyConfig(hidden=(64, 64), init_std=0.2, final_std=0.07),
-    value=ValueConfig(hidden=(64, 64)),
+    policy=PolicyConfig(init_std=0.2, final_std=0.07),
     rollout=RolloutConfig(num_envs=256, steps=50),
-    gan=GanConfig(batch=128, steps=100),
-    backtracking=BacktrackingConfig(trace_length=50),
+    gan=GanConfig(steps=100),
+    backtracking=BacktrackingConfig(trace_length=50, steps=10),
     imitation=ImitationConfig(steps=5, learning_rate=1e-5, max_kl=0.0005),
 )
 POINT = Config(
@@ -121,10 +120,10 @@ POINT = Config(
     updates=8,
     policy=PolicyConfig(input_gain=3.0, init_std=1.0, final_std=0.3),
     value=ValueConfig(input_gain=3.0, minibatch=128),
-    rollout=RolloutConfig(num_envs=32, steps=40),
+    rollout=RolloutConfig(num_envs=64, steps=20),
     goals=GoalsConfig(old=40, r_min=0.05),
     trpo=TrpoConfig(max_kl=0.015),
-    backtracking=BacktrackingConfig(trace_length=20),
+    backtracking=BacktrackingConfig(trace_length=20, steps=5),
     imitation=ImitationConfig(max_kl=0.02),
     coverage=CoverageConfig(rollouts=2, every=250_000),
 )

@@ -45,10 +45,11 @@ def decode(
     if len(experienced) == 0 or len(goals) == 0:
         return Decoded(np.empty((0, env.state_dim)), goals[:0])
     achieved = env.achieved_goals(experienced)
-    distance = np.linalg.norm(goals[:, None] - achieved, axis=2)  # (n, m)
     k = min(NEIGHBOURS, len(experienced))
-    nearest = np.argpartition(distance, k - 1, axis=1)[:, :k]  # (n, k)
-    shift = np.take_along_axis(distance, nearest, axis=1)
+    # The squared distance less |goal|^2, which is the same for all of a row: (n, m).
+    order = np.square(achieved).sum(axis=1) - 2 * goals @ achieved.T
+    nearest = np.argpartition(order, k - 1, axis=1)[:, :k]  # (n, k)
+    shift = np.linalg.norm(goals[:, None] - achieved[nearest], axis=2)
     candidates = env.place(experienced[nearest.ravel()], np.repeat(goals, k, axis=0))
     usable = (shift.ravel() <= max_shift) & env.valid(candidates)
     # A random usable neighbour of each goal: the largest of random keys.

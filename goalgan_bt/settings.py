@@ -11,8 +11,8 @@ from dataclasses import dataclass
 class PolicyConfig:
     """The policy network."""
 
-    hidden: tuple[int, ...] = (128, 128)
-    """Units of the hidden layers (the original: 64 64)."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Units of the hidden layers (as the original)."""
     input_gain: float = 1.0
     """Scale of the first layer's first weights: more lets neighbouring places differ more."""
     init_std: float = 0.6
@@ -28,7 +28,7 @@ class PolicyConfig:
 class ValueConfig:
     """The value function."""
 
-    hidden: tuple[int, ...] = (128, 128)
+    hidden: tuple[int, ...] = (64, 64)
     """Units of the hidden layers."""
     input_gain: float = 1.0
     """As the policy's."""
@@ -87,13 +87,13 @@ class GanConfig:
 
     noise_dim: int = 4
     """Size of z."""
-    generator_hidden: tuple[int, ...] = (256, 256)
-    """Units of the generator's hidden layers (relu)."""
+    generator_hidden: tuple[int, ...] = (128, 128)
+    """Units of the generator's hidden layers, relu (the original: 256 256)."""
     discriminator_hidden: tuple[int, ...] = (128, 128)
     """Units of the discriminator's hidden layers (leaky relu 0.1)."""
     learning_rate: float = 1e-3
     """Step size of RMSProp (decay 0.9), both networks."""
-    batch: int = 256
+    batch: int = 128
     """Real goals, and as many generated ones, per step."""
     steps: int = 60
     """Training steps per iteration (the original: 250 to 300 of a smaller batch)."""
@@ -135,8 +135,8 @@ class BacktrackingConfig:
     hidden: tuple[int, ...] = (128, 128)
     """Units of both networks' hidden layers (paper)."""
     steps: int = 20
-    """Training steps per policy update (paper: 100 per 5 updates)."""
-    batch: int = 256
+    """Training steps per policy update (paper: 100 per 5 updates of four times our batch)."""
+    batch: int = 128
     """Transitions per training step."""
     learning_rate: float = 1e-3
     """Step size of Adam."""

@@ -55,7 +55,7 @@ from goalgan_bt.viz.child import Page
 TEST_ENVS = 512  # simulations side by side when coverage is measured
 FRAME_TRACES = 64  # traces kept in a frame
 FRAME_PATHS = 32  # simulations whose paths are kept in a frame
-SEED_STATES = 4000  # experienced states among which the decoder looks
+SEED_STATES = 2000  # experienced states among which the decoder looks
 KL_SAMPLE = 2048  # observations on which imitation's KL is bounded
 
 
