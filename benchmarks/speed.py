@@ -7,17 +7,19 @@
 Ours: `raw_batch` is `mujoco.batch.Batch.step` on the same model with random controls and nothing
 else, the physical limit. `collection` adds the policy, goals, resets and observations. `training`
 is a whole run of the default preset: learning, labels, GAN, backtracking, imitation, evaluation,
-recording.
+recording; `training_ranks` is the same as so many processes of one thread each.
 
 Others' (rivals.py), for which the extra `bench` is needed: `sb3_contrib_trpo` trains on the same
-task and physics, with 8 simulations in turn, with 32, with 8 in processes, and without our action
-repeat. `gymnasium_robotics` is its own U-maze with random actions, as shipped and with our time
-step and integrator. `envpool` is EnvPool's Ant (no maze) or PointMaze with random actions.
+task and physics as usual, an action per step, with 8 simulations in turn or in processes
+(`_subproc`); `_repeat` holds each action as long as we do, with 8 simulations or 32.
+`gymnasium_robotics` is its own U-maze with random actions, as shipped and with our time step and
+integrator. `envpool` is EnvPool's Ant (no maze) or PointMaze with random actions.
 
 After one warm-up each, every round takes one sample of everything, all environments and numbers of
 threads. The table gives medians and ranges. Factors are over the fastest row of sb3-contrib for the
-same environment with as many threads or fewer, and over gymnasium-robotics as shipped. A step of
-ours and of sb3-contrib simulates 0.02 s; where it is longer or shorter, compare `simulated s/s`.
+same environment with as many threads or fewer, as usual and with our action repeat, and over
+gymnasium-robotics as shipped. A step of ours and of sb3-contrib simulates 0.02 s; where it is
+longer or shorter, compare `simulated s/s`.
 `threads` are the simulation's, for sb3-contrib torch's; what learns beside may keep another core
 busy, as `cores` tells: CPU time per wall time. Run it on an idle machine.
 """
@@ -27,6 +29,7 @@ import io
 import itertools
 import json
 import multiprocessing
+import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
@@ -39,9 +42,9 @@ import numpy as np
 import rivals
 import torch
 import tyro
-from common import Sample, Unavailable, clocked, cores, machine
+from common import Sample, Unavailable, clocked, cores, cpu_seconds, machine
 
-from goalgan_bt import config
+from goalgan_bt import config, record
 from goalgan_bt.config import Config
 from goalgan_bt.learner import Learner
 from goalgan_bt.rollout import Collector
@@ -135,7 +138,34 @@ def training(cfg: Config, durations: Iterable[float], total_steps: int) -> Itera
     return clocked(run, once, make_env(cfg, 1).dt)
 
 
+def training_ranks(cfg: Config, durations: Iterable[float], total_steps: int) -> Iterator[Sample]:
+    """Whole runs by as many processes as there are threads, of one thread each; timed from the
+    moment at which they begin to train. The durations are not heeded."""
+    if cfg.num_threads == 1:
+        raise Unavailable("one rank is `training`")
+    if cfg.rollout.num_envs % cfg.num_threads:
+        raise Unavailable(f"{cfg.num_threads} ranks cannot share {cfg.rollout.num_envs} envs")
+    limits = itertools.chain([1], itertools.repeat(total_steps))
+    launch = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node"]
+    for _, limit in zip(durations, limits, strict=False):
+        with tempfile.TemporaryDirectory() as out:
+            what = f"--env {cfg.env} --threads 1 --viz none --total-steps {limit} --out {out}"
+            what += f" --rollout.num-envs {cfg.rollout.num_envs}"
+            words = [*launch, str(cfg.num_threads), "-m", "goalgan_bt.train", *what.split()]
+            cpu = cpu_seconds()
+            subprocess.run([sys.executable, *words], check=True, capture_output=True)
+            (folder,) = Path(out).iterdir()
+            last = record.read_metrics(folder)[1][-1]
+            seconds = float(last["time/total"])
+            yield Sample(int(last["steps/train"]), seconds, cpu_seconds() - cpu, 0.02)
+
+
 Kind = Callable[[Config, Iterable[float]], Iterator[Sample]]
+
+
+def as_usual(kind: Kind) -> Kind:
+    """The same with an action per step."""
+    return lambda cfg, durations: kind(replace(cfg, action_repeat=1), durations)
 
 
 def kinds(settings: Settings) -> dict[str, Kind]:
@@ -146,12 +176,12 @@ def kinds(settings: Settings) -> dict[str, Kind]:
         "raw_batch": raw_batch,
         "collection": collection,
         "training": partial(training, total_steps=settings.train_steps),
-        # Data-parallel training (`ranks_2x1`, ...) goes here.
-        "sb3_contrib_trpo": sb3,
-        "sb3_contrib_trpo_32": partial(sb3, num_envs=32, n_steps=max(1, settings.sb3_steps // 4)),
-        "sb3_contrib_trpo_subproc": partial(sb3, vector="SubprocVecEnv"),
-        "sb3_contrib_trpo_no_repeat": lambda cfg, durations: sb3(
-            replace(cfg, action_repeat=1), durations
+        "training_ranks": partial(training_ranks, total_steps=settings.train_steps),
+        "sb3_contrib_trpo": as_usual(sb3),
+        "sb3_contrib_trpo_subproc": as_usual(partial(sb3, vector="SubprocVecEnv")),
+        "sb3_contrib_trpo_repeat": sb3,
+        "sb3_contrib_trpo_repeat_32": partial(
+            sb3, num_envs=32, n_steps=max(1, settings.sb3_steps // 4)
         ),
         "gymnasium_robotics": partial(rivals.gymnasium_robotics, our_physics=False),
         "gymnasium_robotics_our_physics": partial(rivals.gymnasium_robotics, our_physics=True),
@@ -229,7 +259,9 @@ def rows_of(measured: list[Measurement]) -> list[dict[str, Any]]:
         sb3 = [o for o in same if o["name"].startswith("sb3") and o["threads"] <= row["threads"]]
         row["factor_over_one_thread"] = factor(row, alone)
         row["share_of_raw"] = factor(row, raw)
-        row["factor_over_sb3"] = factor(row, sb3)
+        usual = [other for other in sb3 if "repeat" not in other["name"]]
+        row["factor_over_sb3"] = factor(row, usual)
+        row["factor_over_sb3_repeat"] = factor(row, sb3)
         row["factor_over_robotics"] = factor(row, shipped)
         row["factor_over_robotics_simulated"] = factor(row, shipped, "sim_seconds_per_second")
         row["rounds"], row["machine"] = len(measured[0].taken), where
@@ -255,6 +287,7 @@ COLUMNS = {  # heading: key of a row
     "x 1 thread": "factor_over_one_thread",
     "of raw": "share_of_raw",
     "x sb3": "factor_over_sb3",
+    "x sb3, repeat": "factor_over_sb3_repeat",
     "x robotics": "factor_over_robotics",
     "x robotics, simulated": "factor_over_robotics_simulated",
 }
