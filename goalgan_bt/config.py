@@ -211,6 +211,8 @@ def check(cfg: Config) -> None:
         raise ConfigError("point_nd has no walls: --map goes with point_... and ant_... mazes")
     if not 2 <= cfg.dim <= 6:
         raise ConfigError(f"--dim must be 2 to 6, not {cfg.dim}")
+    if cfg.dim != 2 and cfg.env != "point_nd":
+        raise ConfigError(f"--dim goes with point_nd: {cfg.env} has two dimensions")
     if cfg.goals.r_min >= cfg.goals.r_max:
         raise ConfigError("--goals.r-min must be less than --goals.r-max")
 

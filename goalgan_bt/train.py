@@ -205,7 +205,9 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
             done = agreed(finished(cfg, learner, clock.total()))
             last = ranks.any_of(done >= 1 or (stop is not None and stop.requested))
             measured = np.full(len(test_goals), np.nan)
-            measure = learner.steps["train"] >= learner.next_coverage or last
+            # Not in the first iteration: its line shall tell at once that all is well.
+            due = learner.iteration > 1 and learner.steps["train"] >= learner.next_coverage
+            measure = due or last
             evaluation: dict[str, float] = {}
             if measure:
                 with clock.measure("evaluation"):
@@ -234,6 +236,7 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
                 | group("steps", learner.steps)
                 | group("time", clock.metrics(learner.steps["train"]))
                 | {
+                    "memory/resident": resident_mib(),
                     "rollout/success": mean(episodes.success),
                     "rollout/std": float(policy.bounded_log_std().detach().exp().mean()),
                     "curriculum/intermediate": mean(labels),
@@ -319,6 +322,15 @@ def agreed(progress: float) -> float:
 def mean(values: np.ndarray) -> float:
     """The mean; NaN of nothing."""
     return float(values.mean()) if values.size else float("nan")
+
+
+def resident_mib() -> float:
+    """Memory that this process has in use, MiB; NaN where the system does not tell."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return float("nan")
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def make_env(cfg: Config, num_envs: int, maze: Maze | None = None) -> GoalEnv:
