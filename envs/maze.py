@@ -103,12 +103,22 @@ class Maze:
 
     def is_free(self, xy: FloatArray) -> BoolArray:
         """Whether each point lies in a free cell: (..., 2) metres -> (...,) bool."""
-        cell = np.floor((xy - self.low) / self.cell_size)
-        rows, columns = self.free.shape
-        with np.errstate(invalid="ignore"):  # a diverged state is nowhere: not free
-            inside = np.all((cell >= 0) & (cell < (columns, rows)), axis=-1)
-            c, r = np.where(inside[..., None], cell, 0).astype(np.int64).T
-        return np.asarray(inside & self.free[r.T, c.T])
+        cell = self._cell(xy - self.low)
+        return np.asarray(self.free[cell[..., 1], cell[..., 0]])
+
+    def _cell(self, offset: FloatArray, axes: int | slice = slice(None)) -> NDArray[np.int64]:
+        """The cells at offsets from `low`, (..., axes) metres, as integers along those axes.
+
+        Whatever lies outside of the map, or nowhere (a diverged state), is put into the border,
+        which is wall. That also makes cutting off the same as rounding down.
+        """
+        cell = np.fmin(np.fmax(offset / self.cell_size, 0.0), self._last[axes])
+        return cell.astype(np.int64)
+
+    @cached_property
+    def _last(self) -> FloatArray:
+        """The last column and row."""
+        return np.array(self.free.shape[::-1]) - 1.0
 
     def cell_centres(self) -> FloatArray:
         """Centres of the free cells, (K, 2), metres."""
@@ -169,23 +179,24 @@ class Maze:
         Returns:
             Positions outside every wall, (n, 2), and which axes a wall stopped, (n, 2) bool.
         """
-        position, stopped = before.copy(), np.zeros(before.shape, dtype=bool)
         inner = radius * (1 - 1e-9)  # a body that touches a wall beside it may move along it
-        for axis in (0, 1):
-            move = after[:, axis] - before[:, axis]
-            side = np.where(move < 0, -1.0, 1.0)
-            corner = position.copy()
-            corner[:, axis] = after[:, axis] + side * radius
-            blocked = np.zeros(len(before), dtype=bool)
-            for edge in (-inner, inner):
-                corner[:, 1 - axis] = position[:, 1 - axis] + edge
-                blocked |= ~self.is_free(corner)
-            # How far the leading edge went into the cell that it must not enter.
-            into = (corner[:, axis] - self.low[axis]) % self.cell_size
-            into = np.where(side > 0, into, self.cell_size - into)
-            back = np.where(blocked, np.minimum(into + 1e-9, np.abs(move)), 0.0)
-            position[:, axis] = after[:, axis] - side * back
+        move = after - before
+        side = np.where(move < 0, -1.0, 1.0)
+        ahead = after + side * radius - self.low  # the leading edges
+        cell = self._cell(ahead)
+        # How far each leading edge goes into the cell that it must perhaps not enter.
+        into = ahead % self.cell_size
+        into = np.where(side > 0, into, self.cell_size - into)
+        back = np.minimum(into + 1e-9, np.abs(move))
+        edges = np.array([[-inner], [inner]])
+        position, stopped = before.copy(), np.empty(before.shape, dtype=bool)
+        for axis, other, free in ((0, 1, self.free.T), (1, 0, self.free)):
+            beside = self._cell(position[:, other] + edges - self.low[other], other)  # (2, n)
+            open_ = free[cell[:, axis], beside]
+            blocked = ~(open_[0] & open_[1])
             stopped[:, axis] = blocked
+            shift = side[:, axis] * np.where(blocked, back[:, axis], 0.0)
+            position[:, axis] = after[:, axis] - shift
         return position, stopped
 
 
