@@ -34,6 +34,8 @@ def build_model(maze: Maze, integrator: str = "implicitfast") -> mujoco.MjModel:
     for actuator in spec.actuators:
         actuator.gear[0] = 2.0  # N per unit of action
     add_walls(spec, maze, height=0.4, collide=False)  # `Maze.slide` stops the body
+    # The level ground cannot act on a body that moves in its plane: no contacts to look for.
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     return spec.compile()
 
 
@@ -62,12 +64,16 @@ class PointMaze(MazeEnv):
         super().__init__(maze, model, num_envs, horizon, action_repeat, threads)
 
     def advance(self, ids: Ids, actions: FloatArray) -> None:
-        self._ctrl[ids] = actions
+        # Views and no indices where everybody moves: with few simulations they are what costs.
+        everyone = len(ids) == self.num_envs
+        some = slice(None) if everyone else ids
+        self._ctrl[some] = actions
+        position = self._qpos[some].copy()
         for _ in range(self.action_repeat):
-            before = self._qpos[ids]
-            self.batch.step(ids)
-            self._qpos[ids], stopped = self.maze.slide(before, self._qpos[ids], RADIUS)
-            self._qvel[ids] = np.where(stopped, 0.0, self._qvel[ids])
+            self.batch.step(None if everyone else ids)
+            position, stopped = self.maze.slide(position, self._qpos[some], RADIUS)
+            self._qpos[some] = position
+            self._qvel[some] = np.where(stopped, 0.0, self._qvel[some])
 
     def observations(
         self, states: FloatArray, goals: FloatArray, achieved: FloatArray | None = None
