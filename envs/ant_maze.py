@@ -163,7 +163,9 @@ class AntMaze(MazeEnv):
 
 def quarter_turns(states: FloatArray, goals: FloatArray) -> NDArray[np.int64]:
     """By how many quarter turns to the left each Ant's front is off its goal, (n,), 0 to 3."""
-    ahead, left = _ahead_and_left(goals - states[:, :2], axes_on_map(states[:, 3:7])[0])
+    w, x, y, z = np.ascontiguousarray(states[:, 3:7].T)
+    front = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)])  # the x axis on the map
+    ahead, left = _ahead_and_left(goals - states[:, :2], front.T)
     turns = np.where(np.abs(ahead) >= np.abs(left), 1 - np.sign(ahead), 2 - np.sign(left))
     return turns.astype(np.int64)
 
@@ -187,16 +189,16 @@ def renumbered(states: FloatArray, turns: NDArray[np.int64]) -> FloatArray:
     out[:, 3:7] *= np.where(out[:, 3:4] < 0, -1.0, 1.0)  # q and -q are the same rotation
     out[:, 18] = cos * states[:, 18] + sin * states[:, 19]  # spin is told in the torso's frame
     out[:, 19] = cos * states[:, 19] - sin * states[:, 18]
-    for joints in (slice(7, 15), slice(21, 29)):
-        moved = np.take_along_axis(states[:, joints], JOINT[turns % 4], axis=1)
-        out[:, joints] = moved * JOINT_SIGN[turns % 4]
+    row, joint, sign = np.arange(len(states))[:, None], JOINT[turns % 4], JOINT_SIGN[turns % 4]
+    out[:, 7:15] = states[row, 7 + joint] * sign
+    out[:, 21:29] = states[row, 21 + joint] * sign
     return out
 
 
 def _renumber_actions(actions: FloatArray, turns: NDArray[np.int64]) -> FloatArray:
     """Torques for legs renumbered as in `renumbered`, (n, 8)."""
-    moved = np.take_along_axis(actions, MOTOR[turns % 4], axis=1)
-    return np.asarray(moved * MOTOR_SIGN[turns % 4])
+    row = np.arange(len(actions))[:, None]
+    return np.asarray(actions[row, MOTOR[turns % 4]] * MOTOR_SIGN[turns % 4])
 
 
 def _ahead_and_left(vector: FloatArray, front: FloatArray) -> tuple[FloatArray, FloatArray]:
