@@ -189,7 +189,7 @@ class Maze:
         inner = radius * (1 - skin)
         low, edges = like(self.low, before), like(np.array([[-inner], [inner]]), before)
         move = after - before
-        side = xp.where(move < 0, -1.0, 1.0)
+        side = xp.asarray(xp.where(move < 0, -1.0, 1.0), dtype=move.dtype)
         ahead = after + side * radius - low  # the leading edges
         cell = self._cell(ahead)
         # How far each leading edge goes into the cell that it must perhaps not enter.
