@@ -15,6 +15,7 @@ from goalgan_bt.coverage import success_rate
 from goalgan_bt.envs import ant_maze
 from goalgan_bt.envs import maze as mazes
 from goalgan_bt.envs.batch import PhysicsError
+from goalgan_bt.envs.warp_batch import MAX_CONSTRAINTS
 from goalgan_bt.policy import GaussianPolicy
 from goalgan_bt.viz.player import Player
 
@@ -121,6 +122,20 @@ def test_a_diverged_simulation_ends_and_hurts_no_other(worlds):
     env.reset(EVERYONE[3:4], NOWHERE[3:4])
     step = env.step(EVERYONE, np.zeros((N, 8)))
     assert np.isfinite(step.states).all() and not step.terminated.any()
+
+
+def test_no_contact_is_left_out(worlds):
+    """Full force in the corner of a cell: the most contacts there are."""
+    env = worlds("ant_umaze")
+    rng = np.random.default_rng(0)
+    states = np.tile(env.start_state, (N, 1))
+    states[:, :2] = -0.6
+    env.reset(EVERYONE, NOWHERE, states)
+    for _ in range(25):
+        env.batch.bind("ctrl")[:] = torch.from_numpy(rng.choice([-1.0, 1.0], (N, 8)))
+        env.batch.step(nstep=4)
+        assert not env.batch.bind("overflow").any()
+        assert 0 < env.batch.bind("nefc").max() < MAX_CONSTRAINTS
 
 
 def test_tensors_share_the_simulations_memory(worlds):
