@@ -34,8 +34,8 @@ def build_model(maze: Maze, integrator: str = "implicitfast") -> mujoco.MjModel:
     for actuator in spec.actuators:
         actuator.gear[0] = 2.0  # N per unit of action
     add_walls(spec, maze, height=0.4, collide=False)  # `Maze.slide` stops the body
-    # The level ground cannot act on a body that moves in its plane: no contacts to look for.
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    # The level ground cannot act on a body that moves in its plane: nothing constrains it.
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     return spec.compile()
 
 
