@@ -146,6 +146,8 @@ def _import() -> tuple[Any, Any]:
         # Kernels are compiled at their first use, which is no news to anybody.
         warp.config.log_level = max(warp.config.log_level, warp.LOG_WARNING)
         import mujoco_warp
+
+        import goalgan_bt.envs.steep_capsules  # noqa: F401
     except ImportError as error:
         raise PhysicsError(
             f"physics 'warp' needs {error.name}: install the extra `gpu`, "

@@ -43,14 +43,11 @@ def worlds():
 BOTH = pytest.mark.parametrize("name", ["point_umaze", "ant_umaze"])
 
 
-def moving_states(name, height=None):
+def moving_states(name):
     """States of bodies in motion, as single precision holds them, and MuJoCo's simulations."""
     env = envs.make(name, N, threads=1, horizon=40)
     rng = np.random.default_rng(0)
-    states = np.tile(env.start_state, (N, 1))
-    if height is not None:
-        states[:, 2] = height
-    env.reset(EVERYONE, NOWHERE, states)
+    env.reset(EVERYONE, NOWHERE)
     for _ in range(5):
         env.step(EVERYONE, rng.uniform(-0.3, 0.3, (N, env.act_dim)))
     return env, env.read_states(EVERYONE).astype(np.float32).astype(float)
@@ -58,23 +55,18 @@ def moving_states(name, height=None):
 
 @BOTH
 def test_a_short_horizon_agrees_with_mujoco(worlds, name):
-    """Tolerances in metres of the torso. In the air and for the point it is rounding alone; feet
-    on the ground multiply it, and mujoco-warp turns the friction pyramid under steep feet."""
+    """Torsos within 10 micrometres after 20 steps, on the ground as in the air: rounding alone."""
     warp = worlds(name)
-    for height, tolerance in (
-        [(None, 1e-5)] if name == "point_umaze" else [(3.0, 1e-5), (None, 0.05)]
-    ):
-        env, states = moving_states(name, height)
-        rng = np.random.default_rng(1)
+    env, states = moving_states(name)
+    rng = np.random.default_rng(1)
+    for each in (env, warp):
+        each.reset(EVERYONE, NOWHERE, states)
+    for _ in range(20):
+        actions = rng.uniform(-1, 1, (N, env.act_dim)).astype(np.float32)
         for each in (env, warp):
-            each.reset(EVERYONE, NOWHERE, states)
-        for _ in range(10):
-            actions = rng.uniform(-0.3, 0.3, (N, env.act_dim)).astype(np.float32)
-            for each in (env, warp):
-                each.advance(EVERYONE, actions)
-        apart = env.read_states(EVERYONE) - warp.read_states(EVERYONE)
-        distance = np.linalg.norm(apart[:, :2], axis=1)
-        assert distance.max() < tolerance
+            each.advance(EVERYONE, actions)
+    apart = env.read_states(EVERYONE) - warp.read_states(EVERYONE)
+    assert np.linalg.norm(apart[:, :2], axis=1).max() < 1e-5
 
 
 @BOTH
