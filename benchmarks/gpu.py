@@ -167,6 +167,7 @@ def coverage(run: Path, device: str) -> list[dict[str, Any]]:
 
 def main() -> None:
     settings = tyro.cli(Settings, description=__doc__)
+    torch.set_num_threads(config.ANT.learning_threads)  # as in training
     gpu = settings.device.startswith("cuda")
     machine = torch.cuda.get_device_name(settings.device) if gpu else "CPU"
     print(f"{machine}, mujoco {mujoco.__version__}, torch {torch.__version__}")
