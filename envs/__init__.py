@@ -26,6 +26,8 @@ def make(
     dim: int = 2,
     map_file: Path | None = None,
     maze: mazes.Maze | None = None,
+    physics: str = "mujoco",
+    device: str = "auto",
 ) -> "GoalEnv":
     """N simulations of the environment of that name.
 
@@ -40,21 +42,27 @@ def make(
         dim: dimensions of `point_nd`, 2 to 6.
         map_file: a text map that replaces the layout (see `goalgan_bt.envs.maze`).
         maze: a maze that replaces both, for example the one that a run has recorded.
+        physics: `mujoco`, or `warp` for mujoco-warp (extra `gpu`), for MuJoCo bodies.
+        device: of mujoco-warp: `cpu`, `cuda`, ...; `auto` is a GPU where there is one.
 
     Raises:
         ValueError: for an unknown name or a dim out of range.
+        PhysicsError: for `warp` where there is none (see `goalgan_bt.envs.warp_batch`).
         MapError: for a map that is not a maze.
     """
     if name not in NAMES:
         raise ValueError(f"unknown environment {name!r}: choose one of {', '.join(NAMES)}")
     # Only now: MuJoCo takes half a second to import, and `--help` needs the names only.
     from goalgan_bt.envs.ant_maze import AntMaze
+    from goalgan_bt.envs.batch import PhysicsError
     from goalgan_bt.envs.point_maze import PointMaze
     from goalgan_bt.envs.point_nd import PointND
 
     if name == "point_nd":
         if not 2 <= dim <= 6:
             raise ValueError(f"point_nd has 2 to 6 dimensions, not {dim}")
+        if physics == "warp":
+            raise PhysicsError("point_nd is no MuJoCo model: warp goes with point_... and ant_...")
         return PointND(dim, num_envs, horizon or 200, action_repeat)
     body, layout = name.split("_")
     constructor = {"point": PointMaze, "ant": AntMaze}[body]
@@ -63,6 +71,6 @@ def make(
     if horizon is None:
         scale = maze.longest_path / mazes.layout("umaze").longest_path
         horizon = max(HORIZON[body], 100 * round(HORIZON[body] * scale / 100))
-    env = constructor(maze, num_envs, horizon, action_repeat, threads, integrator)
+    env = constructor(maze, num_envs, horizon, action_repeat, threads, integrator, physics, device)
     env.name = name if map_file is None else f"{body}_{map_file.stem}"
     return env

@@ -11,8 +11,8 @@ from pathlib import Path
 import gymnasium
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from goalgan_bt.envs.arrays import Array, columns, like, namespace
 from goalgan_bt.envs.batch import INTEGRATORS, MazeEnv, add_walls
 from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
 
@@ -78,23 +78,25 @@ class AntMaze(MazeEnv):
         action_repeat: int,
         threads: int,
         integrator: str,
+        physics: str = "mujoco",
+        device: str = "auto",
     ) -> None:
         model = build_model(maze, integrator)
-        super().__init__(maze, model, num_envs, horizon, action_repeat, threads)
+        super().__init__(maze, model, num_envs, horizon, action_repeat, threads, physics, device)
         mass = self.model.body_mass
         first = self.model.body("front_left_leg").id  # upper leg (fixed), lower leg, foot
-        self._leg_share, self._foot_share = mass[first + 1 : first + 3] / mass.sum()
+        self._leg_share, self._foot_share = (mass[first + 1 : first + 3] / mass.sum()).tolist()
 
-    def observations(
-        self, states: FloatArray, goals: FloatArray, achieved: FloatArray | None = None
-    ) -> NDArray[np.float32]:
+    def observations(self, states: Array, goals: Array, achieved: Array | None = None) -> Array:
+        xp = namespace(states)
         offset = goals - (self.achieved_goals(states) if achieved is None else achieved)
-        offset /= 1.0 + np.linalg.norm(offset, axis=1, keepdims=True)
+        offset /= 1.0 + _length(offset)
         states = renumbered(states, quarter_turns(states, goals))
         along_x, _, along_z = axes_on_map(states[:, 3:7])
-        front = along_x / (np.linalg.norm(along_x, axis=1, keepdims=True) + 1e-9)
+        front = along_x / (_length(along_x) + 1e-9)
         velocity = states[:, 15:17]
-        obs = np.empty((len(states), self.obs_dim), dtype=np.float32)
+        shape = (len(states), self.obs_dim)
+        obs = xp.empty(shape, dtype=xp.float32, device=states.device)
         obs[:, :29] = states
         obs[:, 29:31] = offset
         obs[:, 31:33] = front
@@ -103,24 +105,26 @@ class AntMaze(MazeEnv):
         obs[:, 37], obs[:, 38] = _ahead_and_left(along_z, front)
         return obs
 
-    def to_body(self, actions: FloatArray, states: FloatArray, goals: FloatArray) -> FloatArray:
+    def to_body(self, actions: Array, states: Array, goals: Array) -> Array:
         return _renumber_actions(actions, -quarter_turns(states, goals))
 
-    def from_body(self, actions: FloatArray, states: FloatArray, goals: FloatArray) -> FloatArray:
+    def from_body(self, actions: Array, states: Array, goals: Array) -> Array:
         return _renumber_actions(actions, quarter_turns(states, goals))
 
-    def achieved_goals(self, states: FloatArray) -> FloatArray:
+    def achieved_goals(self, states: Array) -> Array:
         """Centre of mass of the whole Ant, (n, 2): what MuJoCo calls the torso's subtree_com.
 
         The torso and the upper legs are symmetric. A lower leg d, from hip to knee, has its
         middle at d / 2, the foot below it at d (1 + cos ankle) plus its height.
         """
+        xp = namespace(states)
+        legs, lift = like(LEGS, states), like(ANKLE_LIFT, states)
         hip, ankle = states[:, 7:15:2], states[:, 8:15:2]  # (n, 4) rad
-        weight = self._leg_share / 2 + self._foot_share * (1 + np.cos(ankle))
-        cos, sin = weight * np.cos(hip), weight * np.sin(hip)
-        x = cos @ LEGS[:, 0] - sin @ LEGS[:, 1]
-        y = sin @ LEGS[:, 0] + cos @ LEGS[:, 1]
-        z = self._foot_share * (np.sin(ankle) @ ANKLE_LIFT)
+        weight = self._leg_share / 2 + self._foot_share * (1 + xp.cos(ankle))
+        cos, sin = weight * xp.cos(hip), weight * xp.sin(hip)
+        x = cos @ legs[:, 0] - sin @ legs[:, 1]
+        y = sin @ legs[:, 0] + cos @ legs[:, 1]
+        z = self._foot_share * (xp.sin(ankle) @ lift)
         along_x, along_y, along_z = axes_on_map(states[:, 3:7])
         com = along_x * x[:, None] + along_y * y[:, None] + along_z * z[:, None]
         return states[:, :2] + com
@@ -130,11 +134,11 @@ class AntMaze(MazeEnv):
         moved[:, :2] += goals - self.achieved_goals(states)
         return moved
 
-    def healthy(self, states: FloatArray) -> BoolArray:
+    def healthy(self, states: Array) -> Array:
         low, high = HEALTHY_Z
         with np.errstate(invalid="ignore"):
             upright = (states[:, 2] >= low) & (states[:, 2] <= high)
-        return np.asarray(upright & np.isfinite(states).all(axis=1))
+        return upright & namespace(states).isfinite(states).all(axis=1)
 
     def valid(self, states: FloatArray) -> BoolArray:
         """Healthy, the torso a radius away from every wall, no knee or foot inside one."""
@@ -161,58 +165,71 @@ class AntMaze(MazeEnv):
         return states[:, None, :2] + turned
 
 
-def quarter_turns(states: FloatArray, goals: FloatArray) -> NDArray[np.int64]:
+def quarter_turns(states: Array, goals: Array) -> Array:
     """By how many quarter turns to the left each Ant's front is off its goal, (n,), 0 to 3."""
-    w, x, y, z = np.ascontiguousarray(states[:, 3:7].T)
-    front = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)])  # the x axis on the map
+    xp = namespace(states)
+    w, x, y, z = columns(states[:, 3:7])
+    front = xp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)])  # the x axis on the map
     ahead, left = _ahead_and_left(goals - states[:, :2], front.T)
-    turns = np.where(np.abs(ahead) >= np.abs(left), 1 - np.sign(ahead), 2 - np.sign(left))
-    return turns.astype(np.int64)
+    turns = xp.where(abs(ahead) >= abs(left), 1 - xp.sign(ahead), 2 - xp.sign(left))
+    return xp.asarray(turns, dtype=xp.int64)
 
 
-def renumbered(states: FloatArray, turns: NDArray[np.int64]) -> FloatArray:
+def renumbered(states: Array, turns: Array) -> Array:
     """The same physical states with the front turned left and the legs renumbered, (n, 29).
 
     Args:
         states: (n, 29).
-        turns: (n,) quarter turns.
+        turns: (n,) integers, quarter turns.
     """
-    angle = turns * np.pi / 2
-    cos, sin = np.cos(angle), np.sin(angle)
-    out = states.copy()
-    half_cos, half_sin = np.cos(angle / 2), np.sin(angle / 2)
+    xp = namespace(states)
+    angle = turns * (np.pi / 2)
+    cos, sin = xp.cos(angle), xp.sin(angle)
+    out = xp.asarray(states, copy=True)
+    half_cos, half_sin = xp.cos(angle / 2), xp.sin(angle / 2)
     w, x, y, z = states[:, 3:7].T
     out[:, 3] = w * half_cos - z * half_sin  # the quaternion times a turn about z
     out[:, 4] = x * half_cos + y * half_sin
     out[:, 5] = y * half_cos - x * half_sin
     out[:, 6] = z * half_cos + w * half_sin
-    out[:, 3:7] *= np.where(out[:, 3:4] < 0, -1.0, 1.0)  # q and -q are the same rotation
+    out[:, 3:7] *= xp.where(out[:, 3:4] < 0, -1.0, 1.0)  # q and -q are the same rotation
     out[:, 18] = cos * states[:, 18] + sin * states[:, 19]  # spin is told in the torso's frame
     out[:, 19] = cos * states[:, 19] - sin * states[:, 18]
-    row, joint, sign = np.arange(len(states))[:, None], JOINT[turns % 4], JOINT_SIGN[turns % 4]
+    row, joint = _rows(states), like(JOINT, states)[turns % 4]
+    sign = like(JOINT_SIGN, states)[turns % 4]
     out[:, 7:15] = states[row, 7 + joint] * sign
     out[:, 21:29] = states[row, 21 + joint] * sign
     return out
 
 
-def _renumber_actions(actions: FloatArray, turns: NDArray[np.int64]) -> FloatArray:
+def _renumber_actions(actions: Array, turns: Array) -> Array:
     """Torques for legs renumbered as in `renumbered`, (n, 8)."""
-    row = np.arange(len(actions))[:, None]
-    return np.asarray(actions[row, MOTOR[turns % 4]] * MOTOR_SIGN[turns % 4])
+    moved = actions[_rows(actions), like(MOTOR, actions)[turns % 4]]
+    return moved * like(MOTOR_SIGN, actions)[turns % 4]
 
 
-def _ahead_and_left(vector: FloatArray, front: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _rows(array: Array) -> Array:
+    """Indices that pick from every row, (n, 1)."""
+    return namespace(array).arange(len(array), device=array.device)[:, None]
+
+
+def _length(vector: Array) -> Array:
+    """Lengths of vectors in the plane, (n, 2) -> (n, 1)."""
+    return namespace(vector).sqrt(vector[:, :1] ** 2 + vector[:, 1:] ** 2)
+
+
+def _ahead_and_left(vector: Array, front: Array) -> tuple[Array, Array]:
     """Components of vectors (n, 2) along fronts (n, 2) and to their left, each (n,)."""
     ahead = vector[:, 0] * front[:, 0] + vector[:, 1] * front[:, 1]
     left = vector[:, 1] * front[:, 0] - vector[:, 0] * front[:, 1]
     return ahead, left
 
 
-def axes_on_map(quaternion: FloatArray) -> FloatArray:
+def axes_on_map(quaternion: Array) -> Array:
     """Where unit quaternions (w, x, y, z), (n, 4), turn the x, y and z axes: the first two
     components of each, (3, n, 2)."""
-    w, x, y, z = np.ascontiguousarray(quaternion.T)
-    axes = np.empty((3, len(quaternion), 2))
+    w, x, y, z = columns(quaternion)
+    axes = namespace(quaternion).empty((3, len(quaternion), 2), device=w.device)
     axes[0, :, 0] = 1 - 2 * (y * y + z * z)
     axes[0, :, 1] = 2 * (x * y + w * z)
     axes[1, :, 0] = 2 * (x * y - w * z)

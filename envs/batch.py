@@ -1,19 +1,24 @@
 """Many simulations of one goal-reaching task, stepped at once.
 
 `GoalEnv` is the contract between the world and the learner; `MujocoEnv` adds MuJoCo's physics
-and is the only place that knows `mujoco.batch`.
+and is the only place that knows `mujoco.batch`; `warp_batch` has its like for GPUs.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
+from goalgan_bt.envs.arrays import Array, namespace, put
 from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
 
 Ids = NDArray[np.int64]
+
+
+class PhysicsError(ValueError):
+    """Physics that this machine or this environment does not have; the message says what to do."""
 
 
 class Step(NamedTuple):
@@ -45,8 +50,8 @@ class GoalEnv:
     on success, on failure of the body, or after `horizon` steps. Nothing resets by itself.
 
     A state is one float row that holds all that the physics needs; states can be read
-    (`states`), written (`reset`) and mapped to observations and achieved goals in batches of any
-    size, which the decoder and the backtracking model rely on.
+    (`read_states`), written (`reset`) and mapped to observations and achieved goals in batches of
+    any size, which the decoder and the backtracking model rely on.
 
     Attributes:
         name: for example `ant_umaze`.
@@ -90,7 +95,8 @@ class GoalEnv:
         """Size of a state."""
         return len(self.start_state)
 
-    # What a body defines. All take and return rows: (n, state_dim), (n, goal_dim), ...
+    # What a body defines. All take and return rows: (n, state_dim), (n, goal_dim), ... Those that
+    # say `Array` compute on numpy arrays and on torch tensors alike, where there are both.
 
     def read_states(self, ids: Ids) -> FloatArray:
         """A copy of the states of those simulations, (n, state_dim)."""
@@ -100,20 +106,18 @@ class GoalEnv:
         """Put those simulations into those states, (n, state_dim)."""
         raise NotImplementedError
 
-    def advance(self, ids: Ids, actions: FloatArray) -> None:
+    def advance(self, ids: Ids, actions: Array) -> None:
         """Hold actions in [-1, 1], (n, act_dim), for `action_repeat` steps."""
         raise NotImplementedError
 
-    def observations(
-        self, states: FloatArray, goals: FloatArray, achieved: FloatArray | None = None
-    ) -> NDArray[np.float32]:
-        """What the policy sees in those states with those desired goals, (n, obs_dim).
+    def observations(self, states: Array, goals: Array, achieved: Array | None = None) -> Array:
+        """What the policy sees in those states with those desired goals, (n, obs_dim) float32.
 
         `achieved`, (n, goal_dim), saves computing the achieved goals where they are known.
         """
         raise NotImplementedError
 
-    def achieved_goals(self, states: FloatArray) -> FloatArray:
+    def achieved_goals(self, states: Array) -> Array:
         """The goal that each state stands on, (n, goal_dim)."""
         raise NotImplementedError
 
@@ -121,7 +125,7 @@ class GoalEnv:
         """The same states moved so that they achieve those goals, (n, state_dim)."""
         raise NotImplementedError
 
-    def healthy(self, states: FloatArray) -> BoolArray:
+    def healthy(self, states: Array) -> Array:
         """Whether an episode may go on in each state, (n,)."""
         raise NotImplementedError
 
@@ -129,7 +133,7 @@ class GoalEnv:
         """Whether each state is healthy and outside the walls, (n,)."""
         raise NotImplementedError
 
-    def feasible(self, goals: FloatArray) -> BoolArray:
+    def feasible(self, goals: Array) -> Array:
         """Whether each goal lies where the body can be, (n,)."""
         raise NotImplementedError
 
@@ -137,14 +141,14 @@ class GoalEnv:
         """The feasible goals over which coverage is measured, (K, goal_dim)."""
         raise NotImplementedError
 
-    def to_body(self, actions: FloatArray, states: FloatArray, goals: FloatArray) -> FloatArray:
+    def to_body(self, actions: Array, states: Array, goals: Array) -> Array:
         """What a policy's actions, given its observation, mean for the body, (n, act_dim).
 
         They differ where the observation is told in a frame of its own, as the Ant's is.
         """
         return actions
 
-    def from_body(self, actions: FloatArray, states: FloatArray, goals: FloatArray) -> FloatArray:
+    def from_body(self, actions: Array, states: Array, goals: Array) -> Array:
         """The inverse of `to_body`: how a policy would have to say what the body did."""
         return actions
 
@@ -189,15 +193,29 @@ class GoalEnv:
         self.advance(ids, actions)
         self.elapsed[ids] += self.action_repeat
         states = self.read_states(ids)
+        return self.judge(states, actions, goals, self._feasible[ids], self.elapsed[ids])
+
+    def judge(
+        self, states: Array, actions: Array, goals: Array, feasible: Array, elapsed: Array
+    ) -> Step:
+        """What an action gave that ended in those states.
+
+        Args:
+            states: (n, state_dim).
+            actions: (n, act_dim) as the body felt them.
+            goals: (n, goal_dim) desired; feasible: (n,) bool, see `feasible`.
+            elapsed: (n,) steps since the episodes began.
+        """
+        xp = namespace(states)
         healthy = self.healthy(states)
         with np.errstate(invalid="ignore"):  # a diverged state is as far as can be
             achieved = self.achieved_goals(states)
-            distance = np.square(achieved - goals).sum(axis=1)
-            success = healthy & self._feasible[ids] & (distance < self.success_radius**2)
+            distance = xp.square(achieved - goals).sum(axis=1)
+            success = healthy & feasible & (distance < self.success_radius**2)
             obs = self.observations(states, goals, achieved)
         terminated = success | ~healthy
-        truncated = ~terminated & (self.elapsed[ids] >= self.horizon)
-        rewards = success.astype(np.float32)
+        truncated = ~terminated & (elapsed >= self.horizon)
+        rewards = xp.asarray(success, dtype=xp.float32)
         return Step(states, obs, achieved, actions, rewards, terminated, truncated)
 
 
@@ -210,21 +228,28 @@ class MujocoEnv(GoalEnv):
         horizon: steps of an episode.
         action_repeat: steps for which each action is held.
         threads: simulation threads, 0 for one per core. Results do not depend on it.
+        physics: `mujoco`, or `warp` for mujoco-warp in single precision (extra `gpu`).
+        device: of mujoco-warp: `cpu`, `cuda`, `cuda:1`, ...; `auto` is a GPU where there is one.
+
+    Raises:
+        PhysicsError: if mujoco-warp, the device or what the model needs of them is missing.
     """
 
     def __init__(
-        self, model: mujoco.MjModel, num_envs: int, horizon: int, action_repeat: int, threads: int
+        self,
+        model: mujoco.MjModel,
+        num_envs: int,
+        horizon: int,
+        action_repeat: int,
+        threads: int,
+        physics: str = "mujoco",
+        device: str = "auto",
     ) -> None:
         super().__init__(num_envs, horizon, action_repeat)
         self.model = model
-        # A diverged simulation must end its episode, not be put back silently.
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        self.batch = Batch(model, num_envs, threads)
+        self.batch, self._row = _batch(model, num_envs, threads, physics, device)
         self._qpos, self._qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._ctrl = self.batch.bind("ctrl")
-        # A state row of MuJoCo is time, qpos, qvel, ...: ours is a slice of it, read in one go.
-        self._row = self.batch.state[:, 1 : 1 + model.nq + model.nv]
-        assert np.shares_memory(self._row[:, : model.nq], self._qpos)
         self.dt = model.opt.timestep
 
     def read_states(self, ids: Ids) -> FloatArray:
@@ -235,9 +260,27 @@ class MujocoEnv(GoalEnv):
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         self._row[ids] = states
 
-    def advance(self, ids: Ids, actions: FloatArray) -> None:
-        self._ctrl[ids] = actions
+    def advance(self, ids: Ids, actions: Array) -> None:
+        self._ctrl[ids] = put(actions, self._ctrl)
         self.batch.step(ids, nstep=self.action_repeat)
+
+
+def _batch(
+    model: mujoco.MjModel, num_envs: int, threads: int, physics: str, device: str
+) -> tuple[Any, Any]:
+    """The simulations, and their states as rows of qpos and qvel."""
+    if physics == "warp":
+        from goalgan_bt.envs.warp_batch import WarpBatch
+
+        warp = WarpBatch(model, num_envs, device)
+        return warp, warp.rows
+    # A diverged simulation must end its episode, not be put back silently (Warp's never is).
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    batch = Batch(model, num_envs, threads)
+    # A state row of MuJoCo is time, qpos, qvel, ...: ours is a slice of it, read in one go.
+    rows = batch.state[:, 1 : 1 + model.nq + model.nv]
+    assert np.shares_memory(rows[:, : model.nq], batch.bind("qpos"))
+    return batch, rows
 
 
 class MazeEnv(MujocoEnv):
@@ -245,7 +288,7 @@ class MazeEnv(MujocoEnv):
 
     Args:
         maze: the layout.
-        model, num_envs, horizon, action_repeat, threads: see `MujocoEnv`.
+        model, num_envs, horizon, action_repeat, threads, physics, device: see `MujocoEnv`.
     """
 
     maze: Maze
@@ -258,12 +301,14 @@ class MazeEnv(MujocoEnv):
         horizon: int,
         action_repeat: int,
         threads: int,
+        physics: str = "mujoco",
+        device: str = "auto",
     ) -> None:
         self.maze = maze
         self.goal_low, self.goal_high = maze.low, maze.high
-        super().__init__(model, num_envs, horizon, action_repeat, threads)
+        super().__init__(model, num_envs, horizon, action_repeat, threads, physics, device)
 
-    def feasible(self, goals: FloatArray) -> BoolArray:
+    def feasible(self, goals: Array) -> Array:
         return self.maze.is_free(goals)
 
     def test_goals(self) -> FloatArray:

@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from goalgan_bt.envs.arrays import Array, like, namespace
+
 FloatArray = NDArray[np.floating]
 BoolArray = NDArray[np.bool_]
 
@@ -52,6 +54,9 @@ LAYOUTS = {
         #..#...#...#
         ############""",
 }
+
+
+_ZERO = np.zeros(())
 
 
 class MapError(ValueError):
@@ -101,19 +106,20 @@ class Maze:
         """Upper corner of the whole map, walls included, (2,), metres."""
         return self.low + self.cell_size * np.array(self.free.shape[::-1])
 
-    def is_free(self, xy: FloatArray) -> BoolArray:
+    def is_free(self, xy: Array) -> Array:
         """Whether each point lies in a free cell: (..., 2) metres -> (...,) bool."""
-        cell = self._cell(xy - self.low)
-        return np.asarray(self.free[cell[..., 1], cell[..., 0]])
+        cell = self._cell(xy - like(self.low, xy))
+        return like(self.free, xy)[cell[..., 1], cell[..., 0]]
 
-    def _cell(self, offset: FloatArray, axes: int | slice = slice(None)) -> NDArray[np.int64]:
+    def _cell(self, offset: Array, axes: int | slice = slice(None)) -> Array:
         """The cells at offsets from `low`, (..., axes) metres, as integers along those axes.
 
         Whatever lies outside of the map, or nowhere (a diverged state), is put into the border,
         which is wall. That also makes cutting off the same as rounding down.
         """
-        cell = np.fmin(np.fmax(offset / self.cell_size, 0.0), self._last[axes])
-        return cell.astype(np.int64)
+        xp = namespace(offset)
+        first, last = like(_ZERO, offset), like(self._last[axes], offset)
+        return xp.asarray(xp.fmin(xp.fmax(offset / self.cell_size, first), last), dtype=xp.int64)
 
     @cached_property
     def _last(self) -> FloatArray:
@@ -163,9 +169,7 @@ class Maze:
         distance = _distances(self.free, self._start)
         return int(distance[self.free].max())
 
-    def slide(
-        self, before: FloatArray, after: FloatArray, radius: float
-    ) -> tuple[FloatArray, BoolArray]:
+    def slide(self, before: Array, after: Array, radius: float) -> tuple[Array, Array]:
         """Stop a body at the walls, letting it slide along them.
 
         The body collides as an axis-aligned square of half-width `radius`, one axis after the
@@ -179,23 +183,27 @@ class Maze:
         Returns:
             Positions outside every wall, (n, 2), and which axes a wall stopped, (n, 2) bool.
         """
-        inner = radius * (1 - 1e-9)  # a body that touches a wall beside it may move along it
+        xp = namespace(before)
+        # A body that touches a wall beside it may move along it, also after its place is rounded.
+        skin = 1e-9 if before.dtype.itemsize == 8 else 1e-4
+        inner = radius * (1 - skin)
+        low, edges = like(self.low, before), like(np.array([[-inner], [inner]]), before)
         move = after - before
-        side = np.where(move < 0, -1.0, 1.0)
-        ahead = after + side * radius - self.low  # the leading edges
+        side = xp.asarray(xp.where(move < 0, -1.0, 1.0), dtype=move.dtype)
+        ahead = after + side * radius - low  # the leading edges
         cell = self._cell(ahead)
         # How far each leading edge goes into the cell that it must perhaps not enter.
         into = ahead % self.cell_size
-        into = np.where(side > 0, into, self.cell_size - into)
-        back = np.minimum(into + 1e-9, np.abs(move))
-        edges = np.array([[-inner], [inner]])
-        position, stopped = before.copy(), np.empty(before.shape, dtype=bool)
-        for axis, other, free in ((0, 1, self.free.T), (1, 0, self.free)):
-            beside = self._cell(position[:, other] + edges - self.low[other], other)  # (2, n)
-            open_ = free[cell[:, axis], beside]
+        into = xp.where(side > 0, into, self.cell_size - into)
+        back = xp.minimum(into + skin, abs(move))
+        position, stopped = xp.asarray(before, copy=True), xp.empty_like(move, dtype=xp.bool)
+        free = like(self.free, before)
+        for axis, other, free_along in ((0, 1, free.T), (1, 0, free)):
+            beside = self._cell(position[:, other] + edges - low[other], other)  # (2, n)
+            open_ = free_along[cell[:, axis], beside]
             blocked = ~(open_[0] & open_[1])
             stopped[:, axis] = blocked
-            shift = side[:, axis] * np.where(blocked, back[:, axis], 0.0)
+            shift = side[:, axis] * xp.where(blocked, back[:, axis], 0.0)
             position[:, axis] = after[:, axis] - shift
         return position, stopped
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from goalgan_bt.envs.arrays import Array, namespace, put
 from goalgan_bt.envs.batch import INTEGRATORS, Ids, MazeEnv, add_walls
 from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
 
@@ -34,8 +34,8 @@ def build_model(maze: Maze, integrator: str = "implicitfast") -> mujoco.MjModel:
     for actuator in spec.actuators:
         actuator.gear[0] = 2.0  # N per unit of action
     add_walls(spec, maze, height=0.4, collide=False)  # `Maze.slide` stops the body
-    # The level ground cannot act on a body that moves in its plane: no contacts to look for.
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    # The level ground cannot act on a body that moves in its plane: nothing constrains it.
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     return spec.compile()
 
 
@@ -59,35 +59,37 @@ class PointMaze(MazeEnv):
         action_repeat: int,
         threads: int,
         integrator: str,
+        physics: str = "mujoco",
+        device: str = "auto",
     ) -> None:
         model = build_model(maze, integrator)
-        super().__init__(maze, model, num_envs, horizon, action_repeat, threads)
+        super().__init__(maze, model, num_envs, horizon, action_repeat, threads, physics, device)
 
-    def advance(self, ids: Ids, actions: FloatArray) -> None:
+    def advance(self, ids: Ids, actions: Array) -> None:
         # Views and no indices where everybody moves: with few simulations they are what costs.
         everyone = len(ids) == self.num_envs
         some = slice(None) if everyone else ids
-        self._ctrl[some] = actions
-        position = self._qpos[some].copy()
+        xp = namespace(self._qpos)
+        self._ctrl[some] = put(actions, self._ctrl)
+        position = xp.asarray(self._qpos[some], copy=True)
         for _ in range(self.action_repeat):
             self.batch.step(None if everyone else ids)
             position, stopped = self.maze.slide(position, self._qpos[some], RADIUS)
             self._qpos[some] = position
-            self._qvel[some] = np.where(stopped, 0.0, self._qvel[some])
+            self._qvel[some] = xp.where(stopped, 0.0, self._qvel[some])
 
-    def observations(
-        self, states: FloatArray, goals: FloatArray, achieved: FloatArray | None = None
-    ) -> NDArray[np.float32]:
-        return np.concatenate([states, goals - states[:, :2]], axis=1, dtype=np.float32)
+    def observations(self, states: Array, goals: Array, achieved: Array | None = None) -> Array:
+        xp = namespace(states)
+        return xp.asarray(xp.concat([states, goals - states[:, :2]], axis=1), dtype=xp.float32)
 
-    def achieved_goals(self, states: FloatArray) -> FloatArray:
+    def achieved_goals(self, states: Array) -> Array:
         return states[:, :2]
 
     def place(self, states: FloatArray, goals: FloatArray) -> FloatArray:
         return np.concatenate([goals, states[:, 2:]], axis=1)
 
-    def healthy(self, states: FloatArray) -> BoolArray:
-        return np.asarray(np.isfinite(states).all(axis=1))
+    def healthy(self, states: Array) -> Array:
+        return namespace(states).isfinite(states).all(axis=1)
 
     def valid(self, states: FloatArray) -> BoolArray:
         return self.healthy(states) & self.maze.is_free(states[:, :2])

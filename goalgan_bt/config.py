@@ -26,7 +26,7 @@ from goalgan_bt.settings import (
 )
 
 # What a resumed run must keep: another world or other randomness would be another run.
-FIXED = ("env", "seed", "map", "dim", "horizon", "action_repeat", "integrator", "out")
+FIXED = ("env", "seed", "map", "dim", "horizon", "action_repeat", "integrator", "physics", "out")
 
 
 class ConfigError(UsageError):
@@ -63,6 +63,10 @@ class Config:
     """Steps of an episode; by default 200 (point) or 500 (ant), more in longer mazes."""
     integrator: Literal["implicitfast", "rk4"] = "implicitfast"
     """MuJoCo's integrator; rk4 is the original's and costs four times as much."""
+    physics: Literal["mujoco", "warp"] = "mujoco"
+    """What simulates: MuJoCo on the CPU, or mujoco-warp, in single precision (extra `gpu`)."""
+    device: str = "auto"
+    """Where mujoco-warp runs: cpu, cuda, cuda:1, ...; auto is a GPU where there is one."""
     action_repeat: int = 1
     """Steps of 0.02 s for which the policy holds each action (the original: 1)."""
     threads: int = 0
@@ -209,6 +213,12 @@ def check(cfg: Config) -> None:
         raise ConfigError("--horizon must be a multiple of --action-repeat")
     if cfg.map is not None and cfg.env == "point_nd":
         raise ConfigError("point_nd has no walls: --map goes with point_... and ant_... mazes")
+    if cfg.physics == "warp" and cfg.env == "point_nd":
+        raise ConfigError(
+            "point_nd is no MuJoCo model: --physics warp goes with point_... and ant_..."
+        )
+    if cfg.device != "auto" and cfg.physics != "warp":
+        raise ConfigError("--device is mujoco-warp's: it goes with --physics warp")
     if not 2 <= cfg.dim <= 6:
         raise ConfigError(f"--dim must be 2 to 6, not {cfg.dim}")
     if cfg.dim != 2 and cfg.env != "point_nd":

@@ -44,7 +44,7 @@ from goalgan_bt.command_line import UsageError
 from goalgan_bt.config import Config
 from goalgan_bt.coverage import success_rate
 from goalgan_bt.decoder import decode
-from goalgan_bt.envs.batch import GoalEnv
+from goalgan_bt.envs.batch import GoalEnv, PhysicsError
 from goalgan_bt.envs.maze import MapError, Maze
 from goalgan_bt.learner import Learner
 from goalgan_bt.progress import Progress, complain, say
@@ -345,6 +345,8 @@ def make_env(cfg: Config, num_envs: int, maze: Maze | None = None) -> GoalEnv:
         dim=cfg.dim,
         map_file=cfg.map,
         maze=maze,
+        physics=cfg.physics,
+        device=cfg.device,
     )
 
 
@@ -467,7 +469,7 @@ def main() -> int:
             complain(f"the run folder {folder} has vanished: start again")
         elif isinstance(error, ranks.RankError):
             complain(f"rank {ranks.rank()}: {error}{how_to_go_on(folder)}")
-        elif isinstance(error, (UsageError, record.RunError, MapError, OSError)):
+        elif isinstance(error, (UsageError, record.RunError, MapError, PhysicsError, OSError)):
             if ranks.speaks():  # one word is enough
                 complain(str(error))
         else:

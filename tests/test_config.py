@@ -49,6 +49,9 @@ def test_the_command_line_overrides_the_preset(env):
         (["--goals.neighbours", "0"], "greater than 0"),
         (["--horizon", "7", "--action-repeat", "3"], "multiple of --action-repeat"),
         (["--env", "point_nd", "--map", "x.txt"], "point_nd has no walls"),
+        (["--env", "point_nd", "--physics", "warp"], "point_nd is no MuJoCo model"),
+        (["--physics", "bullet"], "bullet"),
+        (["--device", "cuda"], "--device is mujoco-warp's"),
     ],
 )
 def test_bad_flags_are_one_clear_line(flags, message):

@@ -61,7 +61,9 @@ class Player:
     def __init__(self, folder: Path, seed: int = 0) -> None:
         torch.set_num_threads(1)  # the trainer needs the cores
         self._folder = folder
-        cfg, maze = replace(config.load(folder), threads=1), maze_of(folder)
+        # A run on mujoco-warp can be watched where there is none.
+        cfg = replace(config.load(folder), threads=1, physics="mujoco", device="auto")
+        maze = maze_of(folder)
         self.env = make_env(cfg, len(make_env(cfg, 1, maze).test_goals()), maze)
         self._policy = GaussianPolicy(self.env.obs_dim, self.env.act_dim, cfg.policy)
         self._tried: int | None = None  # the checkpoint last looked at, by its time
