@@ -13,7 +13,7 @@ import torch
 
 from goalgan_bt import ranks
 from goalgan_bt.envs.batch import GoalEnv, Ids, Step
-from goalgan_bt.envs.maze import FloatArray
+from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.policy import Actor, GaussianPolicy
 
 
@@ -24,8 +24,21 @@ class Success(NamedTuple):
     steps: int
 
 
+class Coverage(NamedTuple):
+    """stochastic, deterministic: (K,) share of episodes of that policy that reached each goal;
+    steps: environment steps spent."""
+
+    stochastic: FloatArray
+    deterministic: FloatArray
+    steps: int
+
+
 def attempts(
-    env: GoalEnv, policy: GaussianPolicy, goals: FloatArray, noise: torch.Generator | None
+    env: GoalEnv,
+    policy: GaussianPolicy,
+    goals: FloatArray,
+    noise: torch.Generator | None,
+    quiet: BoolArray | None = None,
 ) -> Iterator[tuple[Ids, Step]]:
     """Try goals side by side, once each from the start, until the last episode has ended.
 
@@ -34,6 +47,7 @@ def attempts(
         policy: pi.
         goals: (n, goal_dim).
         noise: draws actions; None for the deterministic policy.
+        quiet: (n,) which of them the deterministic policy tries; none if None.
 
     Yields:
         After each action the goals, as indices, whose episodes it moved on, and what it gave.
@@ -45,6 +59,8 @@ def attempts(
         drawn = None
         if noise is not None:
             drawn = torch.randn(len(active), env.act_dim, generator=noise)
+            if quiet is not None:
+                drawn[torch.from_numpy(quiet[active])] = 0.0
         step = env.step(active, act(obs, drawn))
         yield active, step
         going = ~(step.terminated | step.truncated)
@@ -67,12 +83,40 @@ def success_rate(
         rollouts: episodes per goal.
         noise: draws actions; None for the deterministic policy.
     """
-    tried = np.repeat(goals, rollouts, axis=0)[ranks.share(len(goals) * rollouts)]
-    reached = np.zeros(len(tried))
-    steps = 0
-    for begin in range(0, len(tried), env.num_envs):
-        for active, step in attempts(env, policy, tried[begin : begin + env.num_envs], noise):
+    nobody = np.zeros(len(goals) * rollouts, dtype=bool)
+    reached, steps = _tried(env, policy, np.repeat(goals, rollouts, axis=0), noise, nobody)
+    return Success(reached.reshape(len(goals), rollouts).mean(axis=1), steps)
+
+
+def coverage(
+    env: GoalEnv,
+    policy: GaussianPolicy,
+    goals: FloatArray,
+    rollouts: int,
+    noise: torch.Generator,
+) -> Coverage:
+    """Success of the stochastic policy, `rollouts` episodes per goal, and of the deterministic one,
+    one each, all side by side. Arguments as those of `success_rate`."""
+    quiet = np.tile(np.arange(rollouts + 1) == rollouts, len(goals))
+    reached, steps = _tried(env, policy, np.repeat(goals, rollouts + 1, axis=0), noise, quiet)
+    by_goal = reached.reshape(len(goals), rollouts + 1)
+    return Coverage(by_goal[:, :-1].mean(axis=1), by_goal[:, -1], steps)
+
+
+def _tried(
+    env: GoalEnv,
+    policy: GaussianPolicy,
+    goals: FloatArray,
+    noise: torch.Generator | None,
+    quiet: BoolArray,
+) -> tuple[FloatArray, int]:
+    """Whether each attempt succeeded, (n,), and the environment steps of all."""
+    mine = ranks.share(len(goals))
+    goals, quiet = goals[mine], quiet[mine]
+    reached, steps = np.zeros(len(goals)), 0
+    for begin in range(0, len(goals), env.num_envs):
+        some = slice(begin, begin + env.num_envs)
+        for active, step in attempts(env, policy, goals[some], noise, quiet[some]):
             steps += len(active) * env.action_repeat
             reached[begin + active] = step.rewards
-    rate = ranks.gather(reached).reshape(len(goals), rollouts).mean(axis=1)
-    return Success(rate, int(ranks.total(torch.tensor(steps))))
+    return ranks.gather(reached), int(ranks.total(torch.tensor(steps)))

@@ -42,7 +42,7 @@ from goalgan_bt.advantage import gae
 from goalgan_bt.backtracking import recall_traces
 from goalgan_bt.command_line import UsageError
 from goalgan_bt.config import Config
-from goalgan_bt.coverage import success_rate
+from goalgan_bt.coverage import coverage, success_rate
 from goalgan_bt.decoder import decode
 from goalgan_bt.envs.batch import GoalEnv, PhysicsError
 from goalgan_bt.envs.maze import MapError, Maze
@@ -99,7 +99,7 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
     batch_steps = cfg.rollout.num_envs * cfg.rollout.steps * cfg.action_repeat
     test_goals = env.test_goals()
     clock = Clock(learner.seconds)
-    coverage = float("nan")
+    covered = float("nan")
     everyone = np.arange(env.num_envs)
     extra = 0 if cfg.goals.label_rollouts else cfg.goals.labelled
 
@@ -211,14 +211,13 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
             evaluation: dict[str, float] = {}
             if measure:
                 with clock.measure("evaluation"):
-                    measured, steps = success_rate(
+                    measured, by_mean, steps = coverage(
                         test_env, policy, test_goals, cfg.coverage.rollouts, noise["evaluation"]
                     )
-                    by_mean, mean_steps = success_rate(test_env, policy, test_goals, 1, None)
-                learner.steps["eval"] += steps + mean_steps
+                learner.steps["eval"] += steps
                 learner.next_coverage = learner.steps["train"] + cfg.coverage.every
-                coverage = float(measured.mean())
-                evaluation = {"coverage": coverage, "coverage_deterministic": by_mean.mean()}
+                covered = float(measured.mean())
+                evaluation = {"coverage": covered, "coverage_deterministic": by_mean.mean()}
             with clock.measure("learning"):
                 beside.wait("value", "gan")
                 ranks.agree(learner.tensors())
@@ -269,7 +268,7 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
                 )
     if records is not None:
         records.close("complete" if done >= 1 else "stopped early: --resume goes on")
-    return Trained(coverage, learner.steps["train"])
+    return Trained(covered, learner.steps["train"])
 
 
 def advantages_and_returns(
@@ -455,7 +454,7 @@ def main() -> int:
                 say(f"run folder: {folder}")
                 if cfg.viz == "browser":
                     page = Page(folder, cfg.viz_host, cfg.viz_port)
-            coverage, steps = train(cfg, folder or cfg.resume, stop)
+            trained = train(cfg, folder or cfg.resume, stop)
     except KeyboardInterrupt:
         complain(f"interrupted{how_to_go_on(folder)}")
         return 130
@@ -485,7 +484,7 @@ def main() -> int:
                 complain(f"stopped by {name}: go on with --resume {folder}")
             return 130 if stop.signal == signal.SIGINT else 2
         if folder is not None:
-            say(f"coverage {coverage:.3f} after {steps:,} training steps: {folder}")
+            say(f"coverage {trained.coverage:.3f} after {trained.steps:,} training steps: {folder}")
         ended_well = True
         return 0
     finally:

@@ -2,7 +2,7 @@ import numpy as np
 import torch
 
 from goalgan_bt import envs
-from goalgan_bt.coverage import success_rate
+from goalgan_bt.coverage import coverage, success_rate
 from goalgan_bt.policy import GaussianPolicy, PolicyConfig
 
 
@@ -44,3 +44,17 @@ def test_stochastic_attempts_differ_and_are_averaged():
     rate, _ = success_rate(env, policy, np.array([[0.35, 0.0]]), 64, noise)
     assert 0 < rate[0] < 1
     assert np.isclose(rate[0] * 64 % 1, 0)
+
+
+def test_both_policies_are_measured_side_by_side():
+    """Noise of a huge policy throws the quiet attempts nowhere: they are the deterministic ones."""
+    env = envs.make("point_umaze", 8, threads=1, horizon=60)
+    torch.manual_seed(0)
+    policy = GaussianPolicy(env.obs_dim, env.act_dim, PolicyConfig(hidden=(8,), init_std=1.0))
+    goals = np.array([[0.35, 0.0], [0.0, 0.2], [-0.5, 0.3], [0.1, -0.2], [4.0, 4.0]])
+    found = coverage(env, policy, goals, 3, torch.Generator().manual_seed(0))
+    alone = success_rate(env, policy, goals, 1, None)
+    assert np.array_equal(found.deterministic, alone.rate)
+    assert found.stochastic.shape == (5,) and found.stochastic[4] == 0
+    assert set(np.round(3 * found.stochastic, 6)) <= {0.0, 1.0, 2.0, 3.0}
+    assert alone.steps < found.steps <= 4 * 5 * 60
