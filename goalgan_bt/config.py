@@ -111,9 +111,10 @@ ANT = Config(
     discount=0.993,
     updates=4,
     policy=PolicyConfig(init_std=0.2, final_std=0.07),
-    rollout=RolloutConfig(num_envs=256, steps=50),
+    rollout=RolloutConfig(num_envs=512, steps=25),
     gan=GanConfig(steps=100),
-    backtracking=BacktrackingConfig(trace_length=50, steps=10),
+    trpo=TrpoConfig(fisher_fraction=0.05),
+    backtracking=BacktrackingConfig(trace_length=50),
     imitation=ImitationConfig(steps=5, learning_rate=1e-5, max_kl=0.0005),
 )
 POINT = Config(
@@ -127,7 +128,7 @@ POINT = Config(
     rollout=RolloutConfig(num_envs=64, steps=20),
     goals=GoalsConfig(old=40, r_min=0.05),
     trpo=TrpoConfig(max_kl=0.015),
-    backtracking=BacktrackingConfig(trace_length=20, steps=5),
+    backtracking=BacktrackingConfig(trace_length=20),
     imitation=ImitationConfig(max_kl=0.02),
     coverage=CoverageConfig(rollouts=2, every=250_000),
 )

@@ -17,8 +17,8 @@ def intermediate(success: FloatArray, r_min: float, r_max: float) -> BoolArray:
 
     Which policy the labels describe depends on where `success` comes from. From the
     `SuccessEstimator` (the default) it is an average over the policies that made the last
-    `episodes` episodes. From fresh rollouts (`label_rollouts`) it is the policy after the
-    iteration's updates, as in the original.
+    `episodes` episodes. From fresh rollouts (`label_rollouts`) it is the policy before the last
+    of the iteration's updates (the original: after it).
     """
     return (success > r_min) & (success < r_max)
 

@@ -134,7 +134,7 @@ class BacktrackingConfig:
     """Recall traces per iteration, at most."""
     hidden: tuple[int, ...] = (128, 128)
     """Units of both networks' hidden layers (paper)."""
-    steps: int = 20
+    steps: int = 5
     """Training steps per policy update (paper: 100 per 5 updates of four times our batch)."""
     batch: int = 128
     """Transitions per training step."""
@@ -170,5 +170,5 @@ class CoverageConfig:
 
     rollouts: int = 3
     """Episodes per test goal with the stochastic policy (the original: 2 point, 3 ant)."""
-    every: int = 1_500_000
+    every: int = 2_000_000
     """Training steps between two measurements; one more at the end."""

@@ -56,7 +56,7 @@ TEST_ENVS = 512  # simulations side by side when coverage is measured
 FRAME_TRACES = 64  # traces kept in a frame
 FRAME_PATHS = 32  # simulations whose paths are kept in a frame
 SEED_STATES = 2000  # experienced states among which the decoder looks
-KL_SAMPLE = 2048  # observations on which imitation's KL is bounded
+KL_SAMPLE = 1024  # observations on which imitation's KL is bounded
 
 
 class Trained(NamedTuple):
@@ -128,7 +128,39 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
             imagined = learner.gan.sample(cfg.goals.new)
             goals = np.concatenate([imagined, learner.replay.sample(cfg.goals.old, rng)])
 
-            for _ in range(cfg.updates):
+            for update in range(cfg.updates):
+                if update == cfg.updates - 1:
+                    # Labels: goals neither hopeless nor mastered teach the generator what to
+                    # propose next. It learns beside the last rollouts: nobody waits for it.
+                    if cfg.goals.label_rollouts:
+                        with clock.measure("label"):
+                            success, steps = success_rate(
+                                test_env,
+                                policy,
+                                goals,
+                                cfg.goals.label_rollouts,
+                                noise["evaluation"],
+                            )
+                        learner.steps["label"] += steps
+                    else:
+                        success = learner.estimator(goals)
+                    with clock.measure("learning"):
+                        learner.visited.add(
+                            ranks.gather(env.achieved_goals(env.read_states(everyone)))
+                        )
+                        labels = learner.intermediate(goals, success)
+                        learner.replay.add(goals[labels])
+                        # The estimator's labels are free: the GAN also learns from goals that
+                        # nobody tried.
+                        others = rng.uniform(env.goal_low, env.goal_high, (extra, env.goal_dim))
+                        other_labels = learner.intermediate(others, learner.estimator(others))
+                        beside.start(
+                            "gan",
+                            learner.gan.fit,
+                            np.concatenate([goals, others]),
+                            np.concatenate([labels, other_labels]),
+                        )
+
                 # Rollouts: every simulation goes on where it was.
                 with clock.measure("simulation"):
                     rollouts, episodes = collector.collect(policy, goals)
@@ -153,29 +185,7 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
                         noise["trpo"],
                     )
 
-            # Labels: goals neither hopeless nor mastered teach the generator what to propose next.
-            if cfg.goals.label_rollouts:
-                with clock.measure("label"):
-                    success, steps = success_rate(
-                        test_env, policy, goals, cfg.goals.label_rollouts, noise["evaluation"]
-                    )
-                learner.steps["label"] += steps
-            else:
-                success = learner.estimator(goals)
             with clock.measure("learning"):
-                learner.visited.add(ranks.gather(env.achieved_goals(env.read_states(everyone))))
-                labels = learner.intermediate(goals, success)
-                learner.replay.add(goals[labels])
-                # The estimator's labels are free: the GAN also learns from goals that nobody tried.
-                others = rng.uniform(env.goal_low, env.goal_high, (extra, env.goal_dim))
-                other_labels = learner.intermediate(others, learner.estimator(others))
-                beside.start(
-                    "gan",
-                    learner.gan.fit,
-                    np.concatenate([goals, others]),
-                    np.concatenate([labels, other_labels]),
-                )
-
                 # Recall traces: imagine more ways of getting to those goals, and imitate them.
                 seeds = decode(
                     env,
