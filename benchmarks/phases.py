@@ -64,7 +64,7 @@ PHASES = {
         "goalgan_bt.backtracking:RecallTraces.pairs",
     ),
     "imitation": ("goalgan_bt.imitation:Imitation.update",),
-    "evaluation": ("goalgan_bt.train:success_rate",),
+    "evaluation": ("goalgan_bt.train:coverage",),
     "recording": (
         "goalgan_bt.record:Record.metrics",
         "goalgan_bt.record:Record.frame",

@@ -111,9 +111,8 @@ ANT = Config(
     discount=0.993,
     updates=4,
     policy=PolicyConfig(init_std=0.2, final_std=0.07),
-    rollout=RolloutConfig(num_envs=512, steps=25),
+    rollout=RolloutConfig(num_envs=256, steps=50),
     gan=GanConfig(steps=100),
-    trpo=TrpoConfig(fisher_fraction=0.05),
     backtracking=BacktrackingConfig(trace_length=50),
     imitation=ImitationConfig(steps=5, learning_rate=1e-5, max_kl=0.0005),
 )

@@ -87,8 +87,8 @@ class GanConfig:
 
     noise_dim: int = 4
     """Size of z."""
-    generator_hidden: tuple[int, ...] = (128, 128)
-    """Units of the generator's hidden layers, relu (the original: 256 256)."""
+    generator_hidden: tuple[int, ...] = (256, 256)
+    """Units of the generator's hidden layers (relu)."""
     discriminator_hidden: tuple[int, ...] = (128, 128)
     """Units of the discriminator's hidden layers (leaky relu 0.1)."""
     learning_rate: float = 1e-3

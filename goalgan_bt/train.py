@@ -129,9 +129,19 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
             goals = np.concatenate([imagined, learner.replay.sample(cfg.goals.old, rng)])
 
             for update in range(cfg.updates):
+                # Rollouts: every simulation goes on where it was. The backtracking model learns
+                # what preceded success.
+                with clock.measure("simulation"):
+                    rollouts, episodes = collector.collect(policy, goals)
+                learner.steps["train"] += batch_steps
+                with clock.measure("learning"):
+                    beside.wait("value", "backtracking")
+                    learner.remember(episodes)
+                    beside.start("backtracking", learner.backtracking.fit, learner.transitions)
+
+                # Labels: goals neither hopeless nor mastered teach the generator what to propose
+                # next. It learns beside the last policy update and what follows.
                 if update == cfg.updates - 1:
-                    # Labels: goals neither hopeless nor mastered teach the generator what to
-                    # propose next. It learns beside the last rollouts: nobody waits for it.
                     if cfg.goals.label_rollouts:
                         with clock.measure("label"):
                             success, steps = success_rate(
@@ -161,21 +171,12 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
                             np.concatenate([labels, other_labels]),
                         )
 
-                # Rollouts: every simulation goes on where it was.
-                with clock.measure("simulation"):
-                    rollouts, episodes = collector.collect(policy, goals)
-                learner.steps["train"] += batch_steps
-
                 with clock.measure("learning"):
-                    # Policy: a trust-region step on what happened. The value function and the
-                    # backtracking model (what preceded success) learn beside it, and beside the
-                    # next rollouts: they are needed again only after those.
-                    beside.wait("value", "backtracking")
+                    # Policy: a trust-region step on what happened. The value function learns
+                    # beside it, and beside the next rollouts: only after those it is needed again.
                     obs = policy.normaliser(flat(rollouts.obs))
-                    learner.remember(episodes)
                     advantages, returns = advantages_and_returns(learner, rollouts, obs, cfg)
                     beside.start("value", learner.value.fit, obs, flat(returns), noise["value"])
-                    beside.start("backtracking", learner.backtracking.fit, learner.transitions)
                     step = trpo.update(
                         policy,
                         obs,
