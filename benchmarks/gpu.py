@@ -23,7 +23,7 @@ import tyro
 
 from goalgan_bt import checkpoint, config
 from goalgan_bt.config import Config
-from goalgan_bt.coverage import success_rate
+from goalgan_bt.coverage import coverage as both_policies
 from goalgan_bt.envs.device import DeviceEpisodes
 from goalgan_bt.policy import GaussianPolicy
 from goalgan_bt.train import make_env
@@ -154,14 +154,15 @@ def coverage(run: Path, device: str) -> list[dict[str, Any]]:
     for physics, where in (("mujoco", "auto"), ("warp", device)):
         cfg = replace(cfg, physics=physics, device=where)
         test_goals = make_env(cfg, 1, maze).test_goals()
-        env = make_env(cfg, len(test_goals) * cfg.coverage.rollouts, maze)
+        env = make_env(cfg, len(test_goals) * (cfg.coverage.rollouts + 1), maze)
         policy = GaussianPolicy(env.obs_dim, env.act_dim, cfg.policy)
         checkpoint.load_policy(policy, run)
         noise = torch.Generator().manual_seed(0)
-        found = success_rate(env, policy, test_goals, cfg.coverage.rollouts, noise).rate.mean()
-        by_mean = success_rate(env, policy, test_goals, 1, None).rate.mean()
+        found = both_policies(env, policy, test_goals, cfg.coverage.rollouts, noise)
         row = {"name": "coverage", "env": cfg.env, "physics": physics, "run": run.name}
-        rows.append(row | {"coverage": float(found), "coverage_deterministic": float(by_mean)})
+        by_mean = float(found.deterministic.mean())
+        row["coverage"], row["coverage_deterministic"] = float(found.stochastic.mean()), by_mean
+        rows.append(row)
     return rows
 
 

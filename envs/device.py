@@ -21,7 +21,6 @@ class DeviceEpisodes:
     """
 
     def __init__(self, env: MujocoEnv) -> None:
-        self._where = torch.where
         self.env = env
         batch = env.batch
         self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")

@@ -4,6 +4,7 @@ In single precision, on a GPU or on Warp's CPU device. `bind` gives torch tensor
 simulations' memory: who computes on them stays on the device. Needs the extra `gpu`.
 """
 
+import os
 from typing import Any
 
 import mujoco
@@ -44,7 +45,7 @@ class WarpBatch:
         self._warp, self._mjw = _import()
         self.num_envs = num_envs
         try:
-            self._device = self._warp.get_device(None if device == "auto" else device)
+            self._device = self._warp.get_device(self._best() if device == "auto" else device)
         except (ValueError, RuntimeError):
             known = ", ".join(str(d) for d in self._warp.get_devices())
             raise PhysicsError(f"Warp has no device {device!r} here: choose of {known}") from None
@@ -63,6 +64,11 @@ class WarpBatch:
         self._ctrl = self.bind("ctrl")
         self._graph: Any = None
         self.rows = _Rows(self.bind("qpos"), self.bind("qvel"))
+
+    def _best(self) -> str:
+        """A GPU if there is one, of several another for each of torchrun's processes here."""
+        count = self._warp.get_cuda_device_count()
+        return f"cuda:{int(os.environ.get('LOCAL_RANK', '0')) % count}" if count else "cpu"
 
     def bind(self, name: str) -> Tensor:
         """A field of mujoco-warp's data, (N, ...), as a tensor that shares its memory."""

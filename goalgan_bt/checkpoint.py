@@ -55,5 +55,6 @@ def _saved(folder: Path) -> Iterator[dict[str, Any]]:
         words = str(error).strip().splitlines() or [type(error).__name__]
         reason = words[0].split(". ")[0][:160]
         raise RunError(
-            f"cannot resume from {path}: it is damaged or of other settings ({reason})"
+            f"cannot resume from {path}: it is damaged or of other settings or another version "
+            f"({reason})"
         ) from None

@@ -44,9 +44,9 @@ def _one_line(text: str) -> str:
     """What tyro prints in a box, without the box and without what repeats."""
     words = "".join(" " if c in "╭╮╰╯│─━┃\n" else c for c in text).split()
     line = " ".join(word for word in words if set(word) != {"-"})
-    wrong = re.search(r"Error parsing (--\S+): .*?(?:\['(.*?)'\]|: '(.*?)')", line)
+    wrong = re.search(r"Error parsing (--\S+): .*?(?:\['(.+?)'\]|: '(.+?)')", line)
     if wrong:
-        value = (wrong[2] or wrong[3] or "").replace("', '", " ")
+        value = (wrong[2] or wrong[3]).replace("', '", " ")
         return f"{wrong[1]} cannot be {value!r}; --help tells what it takes"
     line = line.removeprefix("Parsing error ").removeprefix("Unrecognized options ")
     return line.split(" For full helptext")[0][:300] + "; --help lists every setting"

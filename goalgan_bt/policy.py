@@ -104,7 +104,7 @@ class Actor:
         weights, biases = [weight.T for weight in layers[::2]], layers[1::2]
         *self._hidden, self._output = zip(weights, biases, strict=True)
         self._skip = skip.T
-        self.std = policy.bounded_log_std().exp()
+        self._std = policy.bounded_log_std().exp()
 
     @torch.inference_mode()
     def __call__(self, obs: NDArray[np.float32], noise: Tensor | None) -> NDArray[np.float32]:
@@ -121,7 +121,7 @@ class Actor:
         weight, bias = self._output
         actions = torch.addmm(bias, h, weight).addmm_(x, self._skip)
         if noise is not None:
-            actions.addcmul_(noise, self.std)
+            actions.addcmul_(noise, self._std)
         return actions.numpy()
 
 

@@ -4,7 +4,8 @@
 
 Every rank takes part in each update: what is a mean over the batch is a mean over all ranks'
 batches, and finished episodes are told to all, so that goals, labels and the models learned from
-them are the same everywhere. Alone, a process has rank 0 of 1 and nothing here does anything.
+them are the same everywhere, as long as all ranks round alike: give them processors of one kind.
+Alone, a process has rank 0 of 1 and nothing here does anything.
 """
 
 import os
@@ -39,17 +40,11 @@ def begin() -> None:
         RankError: if they cannot be reached.
     """
     global _beside
-    if "RANK" not in os.environ or "WORLD_SIZE" not in os.environ or dist.is_initialized():
+    if not dist.is_torchelastic_launched() or dist.is_initialized():
         return
     with _clear_errors():
         dist.init_process_group("cpu:gloo", timeout=SILENCE)
         _beside = dist.new_group(timeout=SILENCE)
-
-
-def end() -> None:
-    """Leave the other ranks."""
-    if dist.is_initialized():
-        dist.destroy_process_group()
 
 
 def rank() -> int:
@@ -58,8 +53,8 @@ def rank() -> int:
 
 
 def speaks() -> bool:
-    """Whether this is the rank that talks to people, also before the ranks have met."""
-    return os.environ.get("RANK", "0") == "0"
+    """Whether this is the rank that talks to people on this machine, also before all have met."""
+    return not dist.is_torchelastic_launched() or os.environ.get("LOCAL_RANK") == "0"
 
 
 def size() -> int:

@@ -19,19 +19,19 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, _leave)
     signal.signal(signal.SIGTERM, _leave)
     if {"-h", "--help"} & set(sys.argv):
-        from goalgan_bt import config
+        from goalgan_bt import command_line, config
 
-        config.from_command_line()  # ends here
+        try:
+            config.from_command_line()  # ends here
+        except command_line.UsageError as error:
+            print(f"error: {error}", file=sys.stderr)
+            sys.exit(2)
 
 import errno
 import math
-import time
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -40,6 +40,8 @@ from torch import Tensor
 from goalgan_bt import checkpoint, config, envs, ranks, record, trpo
 from goalgan_bt.advantage import gae
 from goalgan_bt.backtracking import recall_traces
+from goalgan_bt.beside import Beside, group
+from goalgan_bt.clock import Clock
 from goalgan_bt.command_line import UsageError
 from goalgan_bt.config import Config
 from goalgan_bt.coverage import coverage, success_rate
@@ -310,11 +312,6 @@ def advantages_and_returns(
     )
 
 
-def group(name: str, values: Mapping[str, float]) -> dict[str, float]:
-    """Metrics under a common name: `name/key`."""
-    return {f"{name}/{key}": value for key, value in values.items()}
-
-
 def finished(cfg: Config, learner: Learner, seconds: float) -> float:
     """How far a run is towards the first of its limits: 1 or more at its end, 0 without limits."""
     return max(
@@ -360,65 +357,6 @@ def make_env(cfg: Config, num_envs: int, maze: Maze | None = None) -> GoalEnv:
     )
 
 
-class Beside:
-    """A thread beside the main one: what learns there may go on during the next rollouts.
-
-    Attributes:
-        metrics: the last ones of all that was waited for.
-    """
-
-    def __init__(self) -> None:
-        self.metrics: dict[str, float] = {}
-        self._thread = ThreadPoolExecutor(1)
-        self._running: dict[str, Future[dict[str, float]]] = {}
-
-    def __enter__(self) -> "Beside":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._thread.shutdown()
-
-    def start(self, name: str, fit: Callable[..., dict[str, float]], *args: Any) -> None:
-        """Call fit(*args), which gives metrics, after what was started before."""
-        self._running[name] = self._thread.submit(fit, *args)
-
-    def wait(self, *names: str) -> None:
-        """Until these have ended, if they were started."""
-        for name in names:
-            if name in self._running:
-                self.metrics |= group(name, self._running.pop(name).result())
-
-
-class Clock:
-    """Wall time, in all and by activity.
-
-    Args:
-        before: seconds of the run before it was resumed.
-    """
-
-    def __init__(self, before: float) -> None:
-        self._before, self._begin = before, time.perf_counter()
-        self._spent = dict.fromkeys(("simulation", "learning", "label", "evaluation"), 0.0)
-
-    def total(self) -> float:
-        """Seconds of the whole run, those before a resume included."""
-        return self._before + time.perf_counter() - self._begin
-
-    @contextmanager
-    def measure(self, activity: str) -> Iterator[None]:
-        """Count what happens inside as that activity."""
-        begin = time.perf_counter()
-        yield
-        self._spent[activity] += time.perf_counter() - begin
-
-    def metrics(self, train_steps: int) -> dict[str, float]:
-        """total in seconds, fps in training steps per second of the whole run, and the shares
-        of this process's time."""
-        here = time.perf_counter() - self._begin
-        shares = {f"{name}_share": spent / here for name, spent in self._spent.items()}
-        return {"total": self.total(), "fps": train_steps / self.total()} | shares
-
-
 class Stop:
     """Turns Ctrl-C and `kill` into a wish that the loop grants after its iteration.
 
@@ -453,9 +391,9 @@ def main() -> int:
         signal.signal(number, signal.default_int_handler)
     folder, page, ended_well = None, None, False
     try:
+        cfg = config.from_command_line()
+        ranks.begin()
         with Stop() as stop:
-            cfg = config.from_command_line()
-            ranks.begin()
             if ranks.rank() == 0:
                 env = make_env(cfg, 1)
                 folder = cfg.resume or record.create_folder(cfg.out, env.name, cfg.seed)
@@ -505,6 +443,8 @@ def main() -> int:
 
 def how_to_go_on(folder: Path | None) -> str:
     """The end of a message about a run that stopped early."""
+    if folder is None and ranks.rank() > 0:
+        return ""  # only rank 0 knows
     if folder is None or not (folder / "checkpoint.pt").exists():
         return ": nothing was saved yet, start again"
     return f": go on from the last checkpoint with --resume {folder}"

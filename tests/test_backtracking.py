@@ -118,7 +118,7 @@ def test_traces_lead_to_their_goal_in_the_real_maze():
     """Each step of a trace, put into the simulator, arrives near the next one."""
     env = envs.make("point_umaze", 300, threads=1)
     states, actions, following = point_experience(env)
-    model, _ = fitted(states, actions, following, steps=2000)
+    model, _ = fitted(states, actions, following, steps=2000, batch=256)
     goals = env.maze.sample_free(100, np.random.default_rng(1))
     goals = goals[np.linalg.norm(goals, axis=1) < 1.5]
     seeds = decode(env, goals, following[::50].astype(float), 0.3, np.random.default_rng(0))

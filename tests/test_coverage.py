@@ -47,7 +47,7 @@ def test_stochastic_attempts_differ_and_are_averaged():
 
 
 def test_both_policies_are_measured_side_by_side():
-    """Noise of a huge policy throws the quiet attempts nowhere: they are the deterministic ones."""
+    """The attempts without noise end as those of the deterministic policy alone do."""
     env = envs.make("point_umaze", 8, threads=1, horizon=60)
     torch.manual_seed(0)
     policy = GaussianPolicy(env.obs_dim, env.act_dim, PolicyConfig(hidden=(8,), init_std=1.0))
@@ -56,5 +56,6 @@ def test_both_policies_are_measured_side_by_side():
     alone = success_rate(env, policy, goals, 1, None)
     assert np.array_equal(found.deterministic, alone.rate)
     assert found.stochastic.shape == (5,) and found.stochastic[4] == 0
+    assert not np.array_equal(found.stochastic, found.deterministic)
     assert set(np.round(3 * found.stochastic, 6)) <= {0.0, 1.0, 2.0, 3.0}
     assert alone.steps < found.steps <= 4 * 5 * 60

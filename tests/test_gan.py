@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from test_mlp import by_torch
 
 from goalgan_bt.gan import GanConfig, GoalGAN
 
@@ -59,3 +60,31 @@ def test_losses_by_hand():
     losses = gan.fit(np.zeros((1, 2)), np.array([True]), steps=1)
     assert losses["discriminator_loss"] == pytest.approx((0.5**2 + 1.5**2) / 2)
     assert losses["generator_loss"] == pytest.approx(0.25)
+
+
+def test_both_gradients_are_autograds():
+    """One step whose optimisers stand still: what they were given, against torch."""
+    gan = make_gan(batch=8)
+    for optimiser in (gan.generator_optimiser, gan.discriminator_optimiser):
+        optimiser.param_groups[0]["lr"] = 0.0
+    state = gan._rng.get_state()
+    rng = np.random.default_rng(0)
+    goals, labels = rng.uniform(LOW, HIGH, (8, 2)), np.arange(8) < 3
+    gan.fit(goals, labels, steps=1)
+    twin = torch.Generator()
+    twin.set_state(state)
+    rows = torch.randint(8, (8,), generator=twin)
+    z = torch.randn(8, gan.cfg.noise_dim, generator=twin)
+    real = torch.from_numpy(2 * (goals - LOW) / (HIGH - LOW) - 1).float()[rows]
+    target = torch.from_numpy(2.0 * labels - 1).float()[rows, None]
+    fake = torch.tanh(by_torch(gan.generator, gan.generator.flat, z))
+
+    def judge(x):
+        return by_torch(gan.discriminator, gan.discriminator.flat, x)
+
+    real_loss, fake_loss = (judge(real) - target) ** 2, (judge(fake.detach()) + 1) ** 2
+    loss = torch.cat([real_loss, fake_loss]).mean()
+    (of_discriminator,) = torch.autograd.grad(loss, gan.discriminator.flat)
+    (of_generator,) = torch.autograd.grad(((judge(fake) - 1) ** 2).mean(), gan.generator.flat)
+    assert torch.allclose(gan.discriminator.flat.grad, of_discriminator, atol=1e-6)
+    assert torch.allclose(gan.generator.flat.grad, of_generator, atol=1e-6)

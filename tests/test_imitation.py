@@ -1,5 +1,6 @@
 import pytest
 import torch
+from test_mlp import by_torch
 
 from goalgan_bt.imitation import Imitation, ImitationConfig
 from goalgan_bt.policy import GaussianPolicy, PolicyConfig, log_prob, mean_kl
@@ -39,3 +40,14 @@ def test_no_traces_change_nothing():
     before = [p.clone() for p in policy.parameters()]
     assert imitation.update(torch.empty(0, 4), torch.empty(0, 2), torch.randn(5, 4)) == {}
     assert all(torch.equal(a, b) for a, b in zip(before, policy.parameters(), strict=True))
+
+
+def test_the_gradient_is_that_of_the_likelihood():
+    policy, imitation = make(steps=1, learning_rate=1e-3, batch=16)
+    imitation.optimiser.param_groups[0]["lr"] = 0.0
+    obs, actions = torch.randn(1, 4), torch.rand(1, 2)
+    imitation.update(obs, actions, obs)
+    mean = by_torch(policy.net, policy.net.flat, obs)
+    loss = -log_prob(mean, policy.bounded_log_std().detach(), actions).mean()
+    (expected,) = torch.autograd.grad(loss, policy.net.flat)
+    assert torch.allclose(policy.net.flat.grad, expected, atol=1e-5)

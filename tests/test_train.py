@@ -224,6 +224,7 @@ def test_a_damaged_checkpoint_is_refused_in_one_line(tmp_path, damage):
         (["--env", "point_umaze", "--map", "none.txt"], "cannot read the map none.txt"),
         (["--env", "point_nd", "--dim", "9"], "--dim must be 2 to 6, not 9"),
         (["--resume", "nowhere"], "nowhere is no run"),
+        (["--resume", "nowhere", "--help"], "nowhere is no run"),
         (["--frobnicate"], "frobnicate"),
     ],
 )

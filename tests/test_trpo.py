@@ -10,6 +10,7 @@ from test_mlp import by_torch
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from goalgan_bt import trpo
+from goalgan_bt.mlp import CHUNK
 from goalgan_bt.policy import GaussianPolicy, PolicyConfig, log_prob, mean_kl
 from goalgan_bt.trpo import TrpoConfig
 
@@ -83,6 +84,27 @@ def test_a_standard_deviation_on_its_floor_has_no_curvature():
     assert product(v)[-2:].tolist() == [2.0, 0.0]
 
 
+def test_the_surrogates_gradient_is_autograds():
+    """Over several pieces of the batch, and with one standard deviation held by its bound."""
+    torch.manual_seed(0)
+    cfg = PolicyConfig(hidden=(5, 4), init_std=0.7, min_std=0.5)
+    policy = GaussianPolicy(3, 2, cfg).double()
+    with torch.no_grad():
+        policy.net.flat += 0.3 * torch.randn_like(policy.net.flat)
+        policy.log_std[1] = -3.0
+    n = 2 * CHUNK + 7
+    obs, actions = torch.randn(n, 3).double(), torch.randn(n, 2).double()
+    advantages = torch.randn(n).double()
+    means, gradient = trpo.surrogate_gradient(policy, obs, actions, advantages)
+    mean, log_std = by_torch(policy.net, policy.net.flat, obs), policy.bounded_log_std()
+    logp = log_prob(mean, log_std, actions)
+    surrogate = (torch.exp(logp - logp.detach()) * advantages).mean()
+    expected = torch.autograd.grad(surrogate, params_of(policy))
+    assert torch.allclose(means, mean)
+    assert torch.allclose(gradient, torch.cat(expected))
+    assert gradient[-1] == 0 and gradient[-2] != 0
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_update_raises_the_surrogate_within_the_bound(seed):
     policy = make_policy((32, 32), seed=seed)
@@ -127,7 +149,7 @@ def test_line_search_checks_both_gain_and_kl():
     assert search(lambda x: (float("nan"), float("nan"))) is None
 
 
-class Beside(torch.nn.Module):
+class WithInput(torch.nn.Module):
     """A network's output with its input beside it."""
 
     def __init__(self, net):
@@ -139,7 +161,7 @@ class Beside(torch.nn.Module):
 
 
 class Sum(torch.nn.Module):
-    """A layer of what `Beside` gave first plus a layer of what it put beside it."""
+    """A layer of what `WithInput` gave first plus a layer of what it put beside it."""
 
     def __init__(self, head, linear):
         super().__init__()
@@ -178,7 +200,7 @@ def test_same_direction_and_same_step_as_sb3_contrib():
     ours = make_policy((16, 16))
     # They have no linear map beside the MLP: it is given to their network.
     body, head = theirs.policy.mlp_extractor.policy_net, theirs.policy.action_net
-    theirs.policy.mlp_extractor.policy_net = Beside(body)
+    theirs.policy.mlp_extractor.policy_net = WithInput(body)
     theirs.policy.action_net = Sum(head, torch.nn.Linear(3, 2, bias=False))
     their_params = [
         *theirs.policy.mlp_extractor.policy_net.parameters(),
