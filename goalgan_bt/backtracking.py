@@ -23,7 +23,6 @@ from goalgan_bt.settings import BacktrackingConfig
 Float32 = NDArray[np.float32]
 
 
-STATISTICS = 5000  # rows from which means and standard deviations are taken
 LOG_VAR = (-10.0, 2.0)  # bounds of the learned log variance, normalised units
 
 
@@ -152,11 +151,13 @@ class BacktrackingModel(nn.Module):
         following = torch.from_numpy(data.next_states[rows])
         actions = torch.from_numpy(data.actions[rows])
         deltas = torch.from_numpy(data.states[rows]) - following
-        # Thousands of rows are sample enough: the whole buffer took longer than the steps.
-        some = torch.randint(n, (STATISTICS,), generator=self._rng).numpy()
-        self.state_scale.set(torch.from_numpy(data.next_states[some]))
-        self.action_scale.set(torch.from_numpy(data.actions[some]))
-        self.delta_scale.set(torch.from_numpy(data.states[some] - data.next_states[some]))
+        # Statistics of these rows alone: the whole buffer took longer than the steps.
+        for scale, x in (
+            (self.state_scale, following),
+            (self.action_scale, actions),
+            (self.delta_scale, deltas),
+        ):
+            scale.set(x)
         losses = np.zeros((steps, 2))
         batches = (x.split(self.cfg.batch) for x in (following, actions, deltas))
         for i, batch in enumerate(zip(*batches, strict=True)):

@@ -391,9 +391,9 @@ def main() -> int:
         signal.signal(number, signal.default_int_handler)
     folder, page, ended_well = None, None, False
     try:
-        cfg = config.from_command_line()
-        ranks.begin()
         with Stop() as stop:
+            cfg = config.from_command_line()
+            ranks.begin()
             if ranks.rank() == 0:
                 env = make_env(cfg, 1)
                 folder = cfg.resume or record.create_folder(cfg.out, env.name, cfg.seed)
