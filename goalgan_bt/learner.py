@@ -45,10 +45,10 @@ class Learner:
             part: torch.Generator().manual_seed(seed)
             for part, seed in zip(NOISY, seeds, strict=True)
         }
-        box = env.goal_low, env.goal_high
+        self._box = env.goal_low, env.goal_high
         self.policy = GaussianPolicy(env.obs_dim, env.act_dim, cfg.policy)
         self.value = ValueFunction(env.obs_dim, cfg.value)
-        self.gan = GoalGAN(*box, cfg.gan, self.noise["gan"])
+        self.gan = GoalGAN(*self._box, cfg.gan, self.noise["gan"])
         self.estimator = SuccessEstimator(env.goal_dim, cfg.goals)
         self.replay = GoalMemory(env.goal_dim, cfg.goals.replay_distance)
         self.visited = GoalMemory(env.goal_dim, cfg.goals.near / 2)
@@ -72,6 +72,26 @@ class Learner:
         """
         near = self.visited.distance_to(goals) <= self.cfg.near
         return intermediate(success, self.cfg.r_min, self.cfg.r_max) & near
+
+    def label(
+        self, goals: FloatArray, success: FloatArray
+    ) -> tuple[BoolArray, FloatArray, BoolArray]:
+        """Label goals that were tried, and keep the intermediate ones for replay.
+
+        Args:
+            goals: (n, goal_dim).
+            success: (n,) how often each is reached.
+
+        Returns:
+            Their labels (n,), and what the GAN shall learn from: these goals and their labels,
+            followed by goals that nobody tried, since the estimator's labels are free.
+        """
+        labels = self.intermediate(goals, success)
+        self.replay.add(goals[labels])
+        extra = 0 if self.cfg.label_rollouts else self.cfg.labelled
+        others = self.rng.uniform(*self._box, (extra, goals.shape[1]))
+        other_labels = self.intermediate(others, self.estimator(others))
+        return labels, np.concatenate([goals, others]), np.concatenate([labels, other_labels])
 
     def estimated_success(self, goals: FloatArray) -> FloatArray:
         """What a map shows: estimated success at goals (n, goal_dim), (n,), but 0 where the agent

@@ -103,7 +103,6 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
     clock = Clock(learner.seconds)
     covered = float("nan")
     everyone = np.arange(env.num_envs)
-    extra = 0 if cfg.goals.label_rollouts else cfg.goals.labelled
 
     # Before any curriculum exists, goals anywhere tell what is out of reach, and the GAN begins
     # with wherever a fresh policy happens to wander.
@@ -157,21 +156,10 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
                     else:
                         success = learner.estimator(goals)
                     with clock.measure("learning"):
-                        learner.visited.add(
-                            ranks.gather(env.achieved_goals(env.read_states(everyone)))
-                        )
-                        labels = learner.intermediate(goals, success)
-                        learner.replay.add(goals[labels])
-                        # The estimator's labels are free: the GAN also learns from goals that
-                        # nobody tried.
-                        others = rng.uniform(env.goal_low, env.goal_high, (extra, env.goal_dim))
-                        other_labels = learner.intermediate(others, learner.estimator(others))
-                        beside.start(
-                            "gan",
-                            learner.gan.fit,
-                            np.concatenate([goals, others]),
-                            np.concatenate([labels, other_labels]),
-                        )
+                        here = env.achieved_goals(env.read_states(everyone))
+                        learner.visited.add(ranks.gather(here))
+                        labels, *lesson = learner.label(goals, success)
+                        beside.start("gan", learner.gan.fit, *lesson)
 
                 with clock.measure("learning"):
                     # Policy: a trust-region step on what happened. The value function learns
@@ -232,11 +220,13 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
                 covered = float(measured.mean())
                 evaluation = {"coverage": covered, "coverage_deterministic": by_mean.mean()}
             with clock.measure("learning"):
-                beside.wait("value", "gan")
+                beside.wait("gan")
+                if measure or ranks.size() > 1:  # else the value function has until the next batch
+                    beside.wait("value")
                 ranks.agree(learner.tensors())
             learner.seconds = clock.total()
 
-            if folder is None or records is None:
+            if records is None:
                 continue
             estimate = learner.estimated_success(test_goals)
             metrics = (
@@ -260,7 +250,7 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
                 }
             )
             if measure:
-                checkpoint.save(learner, folder)
+                checkpoint.save(learner, records.folder)
             records.metrics(metrics)
             if measure or learner.iteration % cfg.report_every == 0:
                 left = clock.total() * max(1 / done - 1, 0) if done else np.inf
