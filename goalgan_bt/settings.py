@@ -28,7 +28,7 @@ class PolicyConfig:
 class ValueConfig:
     """The value function."""
 
-    hidden: tuple[int, ...] = (64, 64)
+    hidden: tuple[int, ...] = (128, 128)
     """Units of the hidden layers."""
     input_gain: float = 1.0
     """As the policy's."""
