@@ -47,6 +47,12 @@ def begin() -> None:
         _beside = dist.new_group(timeout=SILENCE)
 
 
+def end() -> None:
+    """Leave the other ranks; a process that ends without doing so may abort."""
+    if dist.is_initialized():
+        dist.destroy_process_group()
+
+
 def rank() -> int:
     """This process's number; 0 records."""
     return dist.get_rank() if dist.is_initialized() else 0

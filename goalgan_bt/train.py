@@ -427,6 +427,7 @@ def main() -> int:
         ended_well = True
         return 0
     finally:
+        ranks.end()
         if page is not None:
             page.close(ended_well)
 

@@ -63,6 +63,8 @@ assert ranks.any_of(r == 1) and not ranks.any_of(False)
 x = torch.full((3,), float(r))
 ranks.agree([x])
 assert x.tolist() == [0.0] * 3
+ranks.end()
+assert ranks.size() == 1
 """
 
 

@@ -8,7 +8,6 @@ import time
 import msgspec
 import numpy as np
 import pytest
-import torch
 import viser
 import websockets.sync.client
 import zstandard
