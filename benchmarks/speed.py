@@ -29,6 +29,7 @@ import io
 import itertools
 import json
 import multiprocessing
+import os
 import subprocess
 import sys
 import tempfile
@@ -153,7 +154,8 @@ def training_ranks(cfg: Config, durations: Iterable[float], total_steps: int) ->
             what += f" --rollout.num-envs {cfg.rollout.num_envs}"
             words = [*launch, str(cfg.num_threads), "-m", "goalgan_bt.train", *what.split()]
             cpu = cpu_seconds()
-            subprocess.run([sys.executable, *words], check=True, capture_output=True)
+            env = os.environ | {"OMP_NUM_THREADS": "1"}  # torchrun's choice, without its advice
+            subprocess.run([sys.executable, *words], check=True, stdout=subprocess.DEVNULL, env=env)
             (folder,) = Path(out).iterdir()
             last = record.read_metrics(folder)[1][-1]
             seconds = float(last["time/total"])

@@ -71,6 +71,6 @@ def make(
     if horizon is None:
         scale = maze.longest_path / mazes.layout("umaze").longest_path
         horizon = max(HORIZON[body], 100 * round(HORIZON[body] * scale / 100))
-    env = constructor(maze, num_envs, horizon, action_repeat, threads, integrator, physics, device)
+    env = constructor(maze, integrator, num_envs, horizon, action_repeat, threads, physics, device)
     env.name = name if map_file is None else f"{body}_{map_file.stem}"
     return env

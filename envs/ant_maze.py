@@ -7,6 +7,7 @@ redundant.
 """
 
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import mujoco
@@ -34,7 +35,7 @@ MOTOR = (np.roll(JOINT, 2, axis=1) + 2) % 8
 MOTOR_SIGN = np.roll(JOINT_SIGN, 2, axis=1)
 
 
-def build_model(maze: Maze, integrator: str = "implicitfast") -> mujoco.MjModel:
+def build_model(maze: Maze, integrator: str) -> mujoco.MjModel:
     """gymnasium's Ant with the original's step, contacts and walls of 1 m."""
     path = Path(gymnasium.__file__).parent / "envs/mujoco/assets/ant.xml"
     spec = mujoco.MjSpec.from_file(str(path))
@@ -68,21 +69,11 @@ class AntMaze(MazeEnv):
     success_radius = 1.0
     act_dim = 8
     obs_dim = 39
+    model_of = staticmethod(build_model)
     start_state = np.array([0, 0, 0.55, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1] + [0] * 14, float)
 
-    def __init__(
-        self,
-        maze: Maze,
-        num_envs: int,
-        horizon: int,
-        action_repeat: int,
-        threads: int,
-        integrator: str,
-        physics: str = "mujoco",
-        device: str = "auto",
-    ) -> None:
-        model = build_model(maze, integrator)
-        super().__init__(maze, model, num_envs, horizon, action_repeat, threads, physics, device)
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
         mass = self.model.body_mass
         first = self.model.body("front_left_leg").id  # upper leg (fixed), lower leg, foot
         self._leg_share, self._foot_share = (mass[first + 1 : first + 3] / mass.sum()).tolist()

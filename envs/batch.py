@@ -4,6 +4,7 @@
 and is the only place that knows `mujoco.batch`; `warp_batch` has its like for GPUs.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import mujoco
@@ -242,8 +243,8 @@ class MujocoEnv(GoalEnv):
         horizon: int,
         action_repeat: int,
         threads: int,
-        physics: str = "mujoco",
-        device: str = "auto",
+        physics: str,
+        device: str,
     ) -> None:
         super().__init__(num_envs, horizon, action_repeat)
         self.model = model
@@ -288,25 +289,17 @@ class MazeEnv(MujocoEnv):
 
     Args:
         maze: the layout.
-        model, num_envs, horizon, action_repeat, threads, physics, device: see `MujocoEnv`.
+        integrator: `implicitfast` or `rk4`.
+        simulation: num_envs, horizon, action_repeat, threads, physics, device: see `MujocoEnv`.
     """
 
     maze: Maze
+    model_of: Callable[[Maze, str], mujoco.MjModel]  # the body in a maze, with that integrator
 
-    def __init__(
-        self,
-        maze: Maze,
-        model: mujoco.MjModel,
-        num_envs: int,
-        horizon: int,
-        action_repeat: int,
-        threads: int,
-        physics: str = "mujoco",
-        device: str = "auto",
-    ) -> None:
+    def __init__(self, maze: Maze, integrator: str, *simulation: Any) -> None:
         self.maze = maze
         self.goal_low, self.goal_high = maze.low, maze.high
-        super().__init__(model, num_envs, horizon, action_repeat, threads, physics, device)
+        super().__init__(self.model_of(maze, integrator), *simulation)
 
     def feasible(self, goals: Array) -> Array:
         return self.maze.is_free(goals)

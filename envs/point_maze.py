@@ -18,7 +18,7 @@ from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
 RADIUS = 0.1  # m
 
 
-def build_model(maze: Maze, integrator: str = "implicitfast") -> mujoco.MjModel:
+def build_model(maze: Maze, integrator: str) -> mujoco.MjModel:
     """gymnasium-robotics' point body with the original's mass, force, step and walls."""
     # Found, not imported: importing gymnasium-robotics takes a second and prints a notice.
     package = find_spec("gymnasium_robotics")
@@ -49,21 +49,8 @@ class PointMaze(MazeEnv):
     success_radius = 0.3
     act_dim = 2
     obs_dim = 6
+    model_of = staticmethod(build_model)
     start_state = np.zeros(4)
-
-    def __init__(
-        self,
-        maze: Maze,
-        num_envs: int,
-        horizon: int,
-        action_repeat: int,
-        threads: int,
-        integrator: str,
-        physics: str = "mujoco",
-        device: str = "auto",
-    ) -> None:
-        model = build_model(maze, integrator)
-        super().__init__(maze, model, num_envs, horizon, action_repeat, threads, physics, device)
 
     def advance(self, ids: Ids, actions: Array) -> None:
         # Views and no indices where everybody moves: with few simulations they are what costs.

@@ -119,4 +119,4 @@ def _tried(
         for active, step in attempts(env, policy, goals[some], noise, quiet[some]):
             steps += len(active) * env.action_repeat
             reached[begin + active] = step.rewards
-    return ranks.gather(reached), int(ranks.total(torch.tensor(steps)))
+    return ranks.gather(reached), ranks.count(steps)

@@ -41,7 +41,7 @@ class Imitation:
         params = self.policy.net.flat
         with torch.no_grad():
             old_mean, old_log_std = self.policy(reference)
-            n = ranks.total(torch.tensor(float(len(reference)))).item()
+        everybodys = ranks.count(len(reference))
         first_loss, kl, taken = float("nan"), 0.0, 0
         for _ in range(self.cfg.steps):
             rows = torch.randint(len(obs), (self.cfg.batch,), generator=self._rng)
@@ -55,7 +55,7 @@ class Imitation:
             self.optimiser.step()
             with torch.no_grad():
                 kls = len(reference) * mean_kl(old_mean, old_log_std, *self.policy(reference))
-                new_kl = ranks.total(kls).item() / n
+                new_kl = ranks.total(kls).item() / everybodys
                 if not new_kl <= self.cfg.max_kl:
                     params.copy_(before)
                     break

@@ -85,6 +85,10 @@ class GaussianPolicy(nn.Module):
         """Log standard deviation of the actions, (act_dim,)."""
         return self.log_std.clamp(math.log(self.cfg.min_std), math.log(self.max_std.item()))
 
+    def free(self) -> Tensor:
+        """1 for each log standard deviation that learns, 0 where a bound holds it, (act_dim,)."""
+        return (self.bounded_log_std() == self.log_std).to(self.log_std.dtype)
+
     def forward(self, normalised: Tensor) -> tuple[Tensor, Tensor]:
         """Mean (n, act_dim) and log standard deviation (act_dim,) at normalised observations."""
         return self.net(normalised), self.bounded_log_std()

@@ -48,9 +48,12 @@ def begin() -> None:
 
 
 def end() -> None:
-    """Leave the other ranks; a process that ends without doing so may abort."""
+    """Leave the other ranks. A process must do so before it ends: gloo's threads, which end with
+    the last reference to their group, would else wake in a Python that is gone, and abort."""
+    global _beside
     if dist.is_initialized():
         dist.destroy_process_group()
+        _beside = None
 
 
 def rank() -> int:
@@ -79,6 +82,11 @@ def total(x: Tensor, beside: bool = False) -> Tensor:
         with _clear_errors():
             dist.all_reduce(x, group=_beside if beside else None)
     return x
+
+
+def count(n: int) -> int:
+    """The sum of a number over all ranks."""
+    return int(total(torch.tensor(n)))
 
 
 def mean(x: Tensor) -> Tensor:

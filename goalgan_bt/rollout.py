@@ -127,6 +127,10 @@ class Collector:
         """Start every simulation anew, each with one of the goals (G, goal_dim)."""
         self._reset(self._all, pick(goals, self._rng.random(self._total)[self._mine]))
 
+    def achieved_goals(self) -> FloatArray:
+        """Where the simulations of all ranks are, (N, goal_dim)."""
+        return ranks.gather(self.env.achieved_goals(self.env.read_states(self._all)))
+
     def collect(self, policy: GaussianPolicy, goals: FloatArray) -> tuple[Rollouts, Episodes]:
         """Take `cfg.steps` actions in every simulation; new episodes draw from goals (G, goal_dim).
         The rollouts are this rank's, the episodes those of all ranks.

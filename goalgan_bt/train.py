@@ -102,7 +102,6 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
     test_goals = env.test_goals()
     clock = Clock(learner.seconds)
     covered = float("nan")
-    everyone = np.arange(env.num_envs)
 
     # Before any curriculum exists, goals anywhere tell what is out of reach, and the GAN begins
     # with wherever a fresh policy happens to wander.
@@ -113,7 +112,7 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
         learner.remember(episodes)
         learner.steps["train"] += batch_steps
         policy.normaliser.update(flat(rollouts.obs))
-        visited = ranks.gather(env.achieved_goals(env.read_states(everyone)))
+        visited = collector.achieved_goals()
         learner.visited.add(visited)
         learner.gan.fit(visited, np.ones(len(visited), dtype=bool), cfg.gan.pretrain_steps)
     else:
@@ -156,8 +155,7 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
                     else:
                         success = learner.estimator(goals)
                     with clock.measure("learning"):
-                        here = env.achieved_goals(env.read_states(everyone))
-                        learner.visited.add(ranks.gather(here))
+                        learner.visited.add(collector.achieved_goals())
                         labels, *lesson = learner.label(goals, success)
                         beside.start("gan", learner.gan.fit, *lesson)
 

@@ -53,9 +53,8 @@ def fisher_vector_product(
     """
     at = Linearised(policy.net, normalised)
     log_std = policy.bounded_log_std().detach()
-    n = ranks.total(torch.tensor(float(len(normalised)))).item()
-    precision = torch.exp(-2 * log_std) / n
-    free = (log_std == policy.log_std.detach()).to(precision.dtype)  # 0 where a bound holds it
+    precision = torch.exp(-2 * log_std) / ranks.count(len(normalised))
+    free = policy.free()
     split = -len(log_std)
 
     def product(v: Tensor) -> Tensor:
@@ -106,7 +105,7 @@ def surrogate_gradient(
         The means of the policy, (n, act_dim), and the gradient over all ranks, (p,).
     """
     log_std = policy.bounded_log_std()
-    free = (log_std == policy.log_std).to(log_std.dtype)  # 0 where a bound holds it
+    free = policy.free()
     gradients, means = [], []
     columns = (normalised, actions, advantages[:, None] / len(advantages))
     for obs, acts, weight in zip(*(column.split(CHUNK) for column in columns), strict=True):
