@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from goalgan_bt import envs
 from goalgan_bt.command_line import UsageError, parse
+from goalgan_bt.methods import METHODS
 from goalgan_bt.record import write_atomically
 from goalgan_bt.settings import (
     BacktrackingConfig,
@@ -26,7 +27,18 @@ from goalgan_bt.settings import (
 )
 
 # What a resumed run must keep: another world or other randomness would be another run.
-FIXED = ("env", "seed", "map", "dim", "horizon", "action_repeat", "integrator", "physics", "out")
+FIXED = (
+    "env",
+    "method",
+    "seed",
+    "map",
+    "dim",
+    "horizon",
+    "action_repeat",
+    "integrator",
+    "physics",
+    "out",
+)
 
 
 class ConfigError(UsageError):
@@ -40,6 +52,9 @@ class Config:
 
     env: str = "ant_umaze"
     """Environment: {point,ant}_{umaze,spiral,medium,large} or point_nd. Picks the preset."""
+    method: str = "recall_traces"
+    """What to learn with: recall_traces, or one of the baselines and controls of methods.py. Picks
+    settings; other flags come on top."""
     seed: int = 0
     """Seed of everything random."""
     iterations: int | None = None
@@ -147,6 +162,20 @@ def preset(env: str) -> Config:
     return cfg
 
 
+def with_method(cfg: Config, method: str) -> Config:
+    """The same with the settings of a method.
+
+    Raises:
+        ConfigError: if there is no such method.
+    """
+    if method not in METHODS:
+        raise ConfigError(f"unknown method {method!r}: choose one of {', '.join(METHODS)}")
+    for name, value in METHODS[method].items():
+        part, key = name.split(".")
+        cfg = replace(cfg, **{part: replace(getattr(cfg, part), **{key: value})})
+    return replace(cfg, method=method)
+
+
 def check(cfg: Config) -> None:
     """Refuse settings that make no sense.
 
@@ -154,6 +183,7 @@ def check(cfg: Config) -> None:
         ConfigError: naming the first such setting.
     """
     preset(cfg.env)  # is there such an environment?
+    with_method(cfg, cfg.method)  # and such a method?
     above_zero = (
         "iterations total_steps minutes horizon action_repeat learning_threads updates "
         "report_every rollout.num_envs rollout.steps goals.new goals.near goals.episodes "
@@ -243,6 +273,8 @@ def from_command_line(argv: list[str] | None = None) -> Config:
         default = load(Path(run))
     elif (env := _value_of(argv, "--env")) is not None:
         default = preset(env)
+    if run is None and (method := _value_of(argv, "--method")) is not None:
+        default = with_method(default, method)
     cfg = parse(Config, argv, "python -m goalgan_bt.train", default)
     check(cfg)
     if run is not None:

@@ -19,10 +19,12 @@ NEIGHBOURS = 8  # states tried per goal
 
 
 class Decoded(NamedTuple):
-    """states: (m, state_dim); goals: (m, goal_dim), those that could be decoded, m <= n."""
+    """states: (m, state_dim); goals: (m, goal_dim), those that could be decoded, m <= n; shift:
+    (m,) by how much an experienced state was moved, metres."""
 
     states: FloatArray
     goals: FloatArray
+    shift: FloatArray
 
 
 def decode(
@@ -43,7 +45,7 @@ def decode(
         rng: picks among the nearest valid states.
     """
     if len(experienced) == 0 or len(goals) == 0:
-        return Decoded(np.empty((0, env.state_dim)), goals[:0])
+        return Decoded(np.empty((0, env.state_dim)), goals[:0], np.empty(0))
     achieved = env.achieved_goals(experienced)
     k = min(NEIGHBOURS, len(experienced))
     # The squared distance less |goal|^2, which is the same for all of a row: (n, m).
@@ -56,5 +58,6 @@ def decode(
     key = np.where(usable, rng.random(len(usable)), -1.0).reshape(len(goals), k)
     choice = key.argmax(axis=1)
     found = key.max(axis=1) >= 0
-    states = candidates.reshape(len(goals), k, -1)[np.arange(len(goals)), choice]
-    return Decoded(states[found], goals[found])
+    each = np.arange(len(goals))
+    states = candidates.reshape(len(goals), k, -1)[each, choice]
+    return Decoded(states[found], goals[found], shift[each, choice][found])

@@ -11,10 +11,12 @@ from goalgan_bt.backtracking import BacktrackingModel, Transitions
 from goalgan_bt.config import Config
 from goalgan_bt.envs.batch import GoalEnv
 from goalgan_bt.envs.maze import BoolArray, FloatArray
+from goalgan_bt.forward import ForwardModel
 from goalgan_bt.gan import GoalGAN
 from goalgan_bt.goals import GoalMemory, SuccessEstimator, intermediate
 from goalgan_bt.imitation import Imitation
 from goalgan_bt.policy import GaussianPolicy, ValueFunction
+from goalgan_bt.proposals import AlpGmm, feasible, oracle
 from goalgan_bt.rollout import Episodes
 
 NOISY = ("rollout", "evaluation", "trpo", "value", "gan", "backtracking", "imitation")
@@ -28,13 +30,16 @@ class Learner:
             `eval`); seconds: wall time so far.
         rng: numpy's generator; noise: torch's, one per part, since parts learn side by side.
         policy, value, gan, estimator, replay, visited, backtracking, transitions, imitation: the
-            parts.
+            parts; alp_gmm, forward: those that only some controls have, else None.
     """
 
     def __init__(self, env: GoalEnv, cfg: Config) -> None:
         torch.manual_seed(cfg.seed)  # first weights
         self.cfg = cfg.goals
         self._reach = max(env.success_radius, cfg.goals.near)  # metres
+        self._wants_model = (
+            cfg.backtracking.trace_length > 0 and cfg.imitation.source != "successes"
+        )
         self.iteration = 0
         self.steps = {"train": 0, "label": 0, "eval": 0}
         self.seconds = 0.0
@@ -49,20 +54,56 @@ class Learner:
         self.policy = GaussianPolicy(env.obs_dim, env.act_dim, cfg.policy)
         self.value = ValueFunction(env.obs_dim, cfg.value)
         self.gan = GoalGAN(*self._box, cfg.gan, self.noise["gan"])
+        self.alp_gmm = AlpGmm(*self._box, self.rng) if cfg.goals.source == "alp_gmm" else None
         self.estimator = SuccessEstimator(env.goal_dim, cfg.goals)
         self.replay = GoalMemory(env.goal_dim, cfg.goals.replay_distance)
         self.visited = GoalMemory(env.goal_dim, cfg.goals.near / 2)
         self.backtracking = BacktrackingModel(
-            env.state_dim, env.act_dim, cfg.backtracking, self.noise["backtracking"]
+            env.state_dim, env.act_dim, env.goal_dim, cfg.backtracking, self.noise["backtracking"]
         )
-        self.transitions = Transitions(env.state_dim, env.act_dim, cfg.backtracking)
+        self.forward = None
+        if cfg.imitation.source == "forward":
+            self.forward = ForwardModel(
+                env.state_dim, env.act_dim, cfg.backtracking, self.noise["backtracking"]
+            )
+        self.transitions = Transitions(env.state_dim, env.act_dim, env.goal_dim, cfg.backtracking)
         self.imitation = Imitation(self.policy, cfg.imitation, self.noise["imitation"])
+
+    def propose(self, env: GoalEnv) -> tuple[FloatArray, int]:
+        """New goals, (n, goal_dim), and the environment steps that it took to find them.
+
+        Args:
+            env: simulations in which the oracle tries goals.
+        """
+        n = self.cfg.new
+        if self.alp_gmm is not None:
+            return self.alp_gmm.sample(n), 0
+        match self.cfg.source:
+            case "uniform":
+                return self.rng.uniform(*self._box, (n, env.goal_dim)), 0
+            case "feasible":
+                return feasible(env, n, self.rng), 0
+            case "oracle":
+                return oracle(env, self.policy, self.cfg, self.rng, self.noise["evaluation"])
+        return self.gan.sample(n), 0
+
+    def fit_model(self) -> dict[str, float]:
+        """Let the model whose steps are imitated learn what preceded success."""
+        model = self.backtracking if self.forward is None else self.forward
+        return model.fit(self.transitions) if self._wants_model else {}
 
     def remember(self, episodes: Episodes) -> None:
         """Take in finished episodes: outcomes for the estimator, successes to backtrack from."""
-        first = episodes.from_start
-        self.estimator.add(episodes.goals[first], episodes.success[first])
-        self.transitions.add(episodes.states, episodes.actions, episodes.next_states)
+        first, won = episodes.from_start, episodes.success
+        self.estimator.add(episodes.goals[first], won[first])
+        if self.alp_gmm is not None:
+            self.alp_gmm.add(episodes.goals[first], won[first])
+        # Where time ran out, the agent has got to where it is.
+        goals = np.where(won[:, None], episodes.goals, episodes.ends)[episodes.kept]
+        lengths = episodes.lengths[episodes.kept]
+        left = np.repeat(np.cumsum(lengths), lengths) - np.arange(lengths.sum()) - 1
+        goals = np.repeat(goals, lengths, axis=0)
+        self.transitions.add(episodes.states, episodes.actions, episodes.next_states, goals, left)
 
     def intermediate(self, goals: FloatArray, success: FloatArray) -> BoolArray:
         """Labels of goals (n, goal_dim) with that success (n,): intermediate difficulty, (n,).
@@ -88,6 +129,8 @@ class Learner:
         """
         labels = self.intermediate(goals, success)
         self.replay.add(goals[labels])
+        if self.cfg.source == "gan_fit_all":
+            return labels, self.visited.goals, np.ones(len(self.visited), dtype=bool)
         extra = 0 if self.cfg.label_rollouts else self.cfg.labelled
         others = self.rng.uniform(*self._box, (extra, goals.shape[1]))
         other_labels = self.intermediate(others, self.estimator(others))
@@ -112,7 +155,7 @@ class Learner:
             "backtracking": self.backtracking,
             "backtracking_optimiser": self.backtracking.optimiser,
             "imitation_optimiser": self.imitation.optimiser,
-        }
+        } | ({} if self.forward is None else {"forward": self.forward})
 
     def tensors(self) -> list[Tensor]:
         """Every network's parameters and buffers, as they are held."""
@@ -135,10 +178,8 @@ class Learner:
             "estimator_goals": torch.from_numpy(self.estimator.goals),
             "estimator_success": torch.from_numpy(self.estimator.success),
             "transitions": {
-                "states": torch.from_numpy(rows.states[: rows.size]).clone(),
-                "actions": torch.from_numpy(rows.actions[: rows.size]).clone(),
-                "next_states": torch.from_numpy(rows.next_states[: rows.size]).clone(),
-                "cursor": rows.cursor,
+                name: torch.from_numpy(getattr(rows, name)[rows.newest(rows.size)])
+                for name in rows.COLUMNS
             },
         }
 
@@ -166,8 +207,7 @@ class Learner:
         self.visited.goals = state["visited"].numpy().copy()
         self.estimator.goals = state["estimator_goals"].numpy().copy()
         self.estimator.success = state["estimator_success"].numpy().copy()
-        saved = state["transitions"]
-        self.transitions.size = self.transitions.cursor = 0
-        oldest = int(saved["cursor"]) % max(1, len(saved["states"]))
-        columns = ("states", "actions", "next_states")
-        self.transitions.add(*(np.roll(saved[name].numpy(), -oldest, axis=0) for name in columns))
+        rows = self.transitions
+        rows.size = rows.cursor = rows.added = 0
+        rows.add(*(state["transitions"][name].numpy() for name in rows.COLUMNS))
+        self.backtracking.seen = rows.added

@@ -20,6 +20,7 @@ import platform
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -147,15 +148,21 @@ class Record:
             self._events.close()
 
     def _rewrite(self) -> None:
-        def write(file: Any) -> None:
-            text = io.TextIOWrapper(file, newline="")
-            writer = csv.DictWriter(text, self._columns, restval="")
-            writer.writeheader()
-            writer.writerows(self._rows)
-            text.flush()
-            text.detach()
+        write_table(self.folder / "metrics.csv", self._columns, self._rows)
 
-        write_atomically(self.folder / "metrics.csv", write)
+
+def write_table(path: Path, columns: Sequence[str], rows: list[dict[str, str]]) -> None:
+    """Write rows as CSV, all or nothing; what a row lacks is an empty cell."""
+
+    def write(file: Any) -> None:
+        text = io.TextIOWrapper(file, newline="")
+        writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        text.flush()
+        text.detach()
+
+    write_atomically(path, write)
 
 
 def write_atomically(path: Path, write: Any) -> None:

@@ -70,15 +70,18 @@ class Episodes:
     """Episodes that ended in a batch, E of them, simulation by simulation.
 
     goals: (E, goal_dim); success: (E,) whether the goal was reached; from_start: (E,) whether the
-    episode began in the start state; lengths: (E,) actions.
-    Transitions of the successful ones, M in all, in the order in which they happened: states,
-    next_states (M, state_dim), actions (M, act_dim) as the body felt them.
+    episode began in the start state; lengths: (E,) actions; ends: (E, goal_dim) where it ended;
+    kept: (E,) whether its transitions are here.
+    Transitions of those, M in all, in the order in which they happened: states, next_states
+    (M, state_dim), actions (M, act_dim) as the body felt them.
     """
 
     goals: FloatArray
     success: BoolArray
     from_start: BoolArray
     lengths: NDArray[np.int64]
+    ends: FloatArray
+    kept: BoolArray
     states: Float32
     actions: Float32
     next_states: Float32
@@ -92,6 +95,8 @@ class Collector:
         cfg: settings.
         rng: draws goals and chains.
         noise: draws actions.
+        failures: whether to keep the transitions of episodes that ran out of time, besides those
+            that succeeded.
     """
 
     def __init__(
@@ -100,7 +105,9 @@ class Collector:
         cfg: RolloutConfig,
         rng: np.random.Generator,
         noise: torch.Generator,
+        failures: bool = False,
     ) -> None:
+        self._failures = failures
         self.env, self.cfg, self._rng, self._noise = env, cfg, rng, noise
         n = env.num_envs
         self._all = np.arange(n)
@@ -143,8 +150,8 @@ class Collector:
         # For each step: a draw of whether the next episode is chained and of its goal.
         draws = self._rng.random((steps, 2, self._total))[..., self._mine]
         truncated_obs = []
-        ended: list[tuple[Ids, BoolArray, FloatArray, BoolArray, NDArray[np.int64]]] = []
-        successes: list[tuple[int, Float32, Float32]] = []
+        ended: list[tuple[np.ndarray, ...]] = []  # Episodes' columns, with ids before them
+        paths: list[tuple[int, Float32, Float32]] = []
         obs = env.observe(ids)
         for t in range(steps):
             actions = act(obs, noise[t])
@@ -160,14 +167,16 @@ class Collector:
             obs = step.obs
             if len(done):
                 reached = step.rewards[done] > 0
-                lengths = self._age[done]
-                ended.append((done, reached, env.goals[done], self._from_start[done], lengths))
-                for i, length in zip(done[reached], lengths[reached], strict=True):
-                    successes.append(
+                fell = step.terminated[done] & ~reached
+                lengths, kept = self._age[done], ~fell if self._failures else reached
+                goals_then, ends = env.goals[done], step.achieved[done]
+                first = self._from_start[done]
+                ended.append((done, goals_then, reached, first, lengths, ends, kept))
+                for i, length in zip(done[kept], lengths[kept], strict=True):
+                    paths.append(
                         (i, self._states[: length + 1, i].copy(), self._actions[:length, i].copy())
                     )
                 truncated_obs.append(obs[step.truncated])
-                fell = step.terminated[done] & ~reached
                 chained = ~fell & (draws[t, 0, done] < self.cfg.chain)
                 following = pick(goals, draws[t, 1, done])
                 self._chain(done[chained], following[chained])
@@ -184,7 +193,7 @@ class Collector:
             np.concatenate([np.empty((0, env.obs_dim), np.float32), *truncated_obs]),
             self._achieved,
         )
-        return rollouts, self._episodes(ended, successes)
+        return rollouts, self._episodes(ended, paths)
 
     def _reset(self, ids: Ids, goals: FloatArray) -> None:
         if len(ids) == 0:
@@ -203,26 +212,28 @@ class Collector:
         self._from_start[ids] = False
 
     def _episodes(
-        self, ended: list[Any], successes: list[tuple[int, Float32, Float32]]
+        self, ended: list[tuple[np.ndarray, ...]], paths: list[tuple[int, Float32, Float32]]
     ) -> Episodes:
         env = self.env
-        ids, reached, goals, from_start, lengths = (
-            [np.concatenate(column) for column in zip(*ended, strict=True)]
-            if ended
-            else [np.empty(0)] * 2 + [np.empty((0, env.goal_dim))] + [np.empty(0)] * 2
-        )
+        nowhere, no = np.empty((0, env.goal_dim)), np.empty(0, dtype=bool)
+        none = np.empty(0, dtype=np.int64)
+        nothing = (none, nowhere, no, no, none, nowhere, no)
+        ids, *rows = (np.concatenate(column) for column in zip(nothing, *ended, strict=True))
         order = np.argsort(ids, kind="stable")
-        successes.sort(key=itemgetter(0))
+        goals, success, from_start, lengths, ends, kept = (ranks.gather(row[order]) for row in rows)
+        paths.sort(key=itemgetter(0))
         no_states = np.empty((0, env.state_dim), np.float32)
         no_actions = np.empty((0, env.act_dim), np.float32)
         return Episodes(
-            ranks.gather(goals[order]),
-            ranks.gather(reached[order].astype(bool)),
-            ranks.gather(from_start[order].astype(bool)),
-            ranks.gather(lengths[order].astype(np.int64)),
-            ranks.gather(np.concatenate([no_states, *(s[:-1] for _, s, _ in successes)])),
-            ranks.gather(np.concatenate([no_actions, *(a for *_, a in successes)])),
-            ranks.gather(np.concatenate([no_states, *(s[1:] for _, s, _ in successes)])),
+            goals,
+            success,
+            from_start,
+            lengths,
+            ends,
+            kept,
+            ranks.gather(np.concatenate([no_states, *(s[:-1] for _, s, _ in paths)])),
+            ranks.gather(np.concatenate([no_actions, *(a for *_, a in paths)])),
+            ranks.gather(np.concatenate([no_states, *(s[1:] for _, s, _ in paths)])),
         )
 
 

@@ -5,6 +5,7 @@ importing the learner takes seconds.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -56,14 +57,18 @@ class RolloutConfig:
 
 @dataclass(frozen=True)
 class GoalsConfig:
-    """Labels and replay of goals."""
+    """Proposal, labels and replay of goals."""
 
+    source: Literal["gan", "gan_fit_all", "uniform", "feasible", "oracle", "alp_gmm"] = "gan"
+    """What proposes goals: the GAN; a GAN of all places where the agent has been; the uniform
+    distribution over the box, or over the free space; that of free goals which fresh episodes show
+    to be of intermediate difficulty; ALP-GMM (extra `study`)."""
     r_min: float = 0.1
     """Goals reached less often are too hard (Florensa 2018)."""
     r_max: float = 0.9
     """Goals reached more often are mastered (Florensa 2018)."""
     new: int = 200
-    """Goals from the GAN per iteration."""
+    """Proposed goals per iteration."""
     old: int = 100
     """Goals from the replay per iteration."""
     labelled: int = 1000
@@ -140,20 +145,35 @@ class BacktrackingConfig:
     """Transitions per training step."""
     learning_rate: float = 1e-3
     """Step size of Adam."""
+    experience: Literal["successes", "all"] = "successes"
+    """Episodes whose transitions are kept: those that reached their goal, or also those that ran
+    out of time, for the place where they ended (hindsight)."""
     buffer: int = 100_000
-    """Transitions of successful episodes that are kept, newest first."""
+    """Transitions that are kept, the newest."""
     min_transitions: int = 5_000
     """No training and no traces before the buffer holds this many."""
     max_shift: float = 0.5
     """The decoder moves an experienced state by at most this much to a goal, metres."""
     sample_actions: bool = True
     """Sample a ~ q(a | s'), as in the paper; otherwise its mean."""
+    conditioned: bool = False
+    """Tell q(a | s') for which goal the action was (the paper: no)."""
+    seeds: Literal["goals", "values"] = "goals"
+    """Where traces begin: at decoded goals, or at the experienced states of highest value
+    (Algorithm 2)."""
 
 
 @dataclass(frozen=True)
 class ImitationConfig:
     """Imitation of recall traces."""
 
+    source: Literal["traces", "successes", "forward"] = "traces"
+    """What is imitated: recall traces; as many steps before the end of episodes that really
+    succeeded (self-imitation); steps that a forward model imagines of the policy, where they reach
+    the goal (after Dyna). The latter two are controls."""
+    relabel: bool = False
+    """Imitate each step for a random later place of its trace or episode (hindsight) instead of
+    for the goal at its end."""
     steps: int = 20
     """Gradient steps per iteration."""
     batch: int = 512

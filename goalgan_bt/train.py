@@ -39,15 +39,16 @@ from torch import Tensor
 
 from goalgan_bt import checkpoint, config, envs, ranks, record, trpo
 from goalgan_bt.advantage import gae
-from goalgan_bt.backtracking import recall_traces
+from goalgan_bt.backtracking import RecallTraces, Steps, consistency, recall_traces
 from goalgan_bt.beside import Beside, group
 from goalgan_bt.clock import Clock
 from goalgan_bt.command_line import UsageError
 from goalgan_bt.config import Config
 from goalgan_bt.coverage import coverage, success_rate
-from goalgan_bt.decoder import decode
+from goalgan_bt.decoder import Decoded, decode
 from goalgan_bt.envs.batch import GoalEnv, PhysicsError
 from goalgan_bt.envs.maze import MapError, Maze
+from goalgan_bt.forward import imagine
 from goalgan_bt.learner import Learner
 from goalgan_bt.progress import Progress, complain, say
 from goalgan_bt.record import Record
@@ -97,7 +98,8 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
         records = Record(folder, learner.iteration)
         config.save(cfg, folder)
     policy, rng, noise = learner.policy, learner.rng, learner.noise
-    collector = Collector(env, cfg.rollout, rng, noise["rollout"])
+    failures = cfg.backtracking.experience == "all"
+    collector = Collector(env, cfg.rollout, rng, noise["rollout"], failures)
     batch_steps = cfg.rollout.num_envs * cfg.rollout.steps * cfg.action_repeat
     test_goals = env.test_goals()
     clock = Clock(learner.seconds)
@@ -116,7 +118,7 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
         learner.visited.add(visited)
         learner.gan.fit(visited, np.ones(len(visited), dtype=bool), cfg.gan.pretrain_steps)
     else:
-        collector.begin(learner.gan.sample(cfg.goals.new))
+        collector.begin(learner.propose(test_env)[0])
 
     with Progress(f"{env.name}, seed {cfg.seed}") as terminal, Beside() as beside:
         last = False
@@ -125,7 +127,8 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
             policy.cap_std(agreed(finished(cfg, learner, clock.total())))
 
             # Goals: most imagined by the generator, some remembered so that old skills stay.
-            imagined = learner.gan.sample(cfg.goals.new)
+            imagined, steps = learner.propose(test_env)
+            learner.steps["label"] += steps
             goals = np.concatenate([imagined, learner.replay.sample(cfg.goals.old, rng)])
 
             for update in range(cfg.updates):
@@ -137,7 +140,7 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
                 with clock.measure("learning"):
                     beside.wait("value", "backtracking")
                     learner.remember(episodes)
-                    beside.start("backtracking", learner.backtracking.fit, learner.transitions)
+                    beside.start("backtracking", learner.fit_model)
 
                 # Labels: goals neither hopeless nor mastered teach the generator what to propose
                 # next. It learns beside the last policy update and what follows.
@@ -157,7 +160,8 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
                     with clock.measure("learning"):
                         learner.visited.add(collector.achieved_goals())
                         labels, *lesson = learner.label(goals, success)
-                        beside.start("gan", learner.gan.fit, *lesson)
+                        if cfg.goals.source in ("gan", "gan_fit_all"):
+                            beside.start("gan", learner.gan.fit, *lesson)
 
                 with clock.measure("learning"):
                     # Policy: a trust-region step on what happened. The value function learns
@@ -176,21 +180,17 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
 
             with clock.measure("learning"):
                 # Recall traces: imagine more ways of getting to those goals, and imitate them.
-                seeds = decode(
-                    env,
-                    rng.permutation(goals[labels])[: cfg.backtracking.traces],
-                    learner.transitions.sample_states(SEED_STATES, rng),
-                    cfg.backtracking.max_shift,
-                    rng,
-                )
+                wanted = rng.permutation(goals[labels])[: cfg.backtracking.traces]
+                if cfg.backtracking.seeds == "values":
+                    beside.wait("value")
+                    seeds = most_valuable(learner, env, cfg.backtracking.traces)
+                else:
+                    experienced, _ = learner.transitions.sample(SEED_STATES, rng)
+                    seeds = decode(env, wanted, experienced, cfg.backtracking.max_shift, rng)
                 beside.wait("backtracking")
-                traces = recall_traces(
-                    learner.backtracking,
-                    env,
-                    *seeds,
-                    length=math.ceil(cfg.backtracking.trace_length / cfg.action_repeat),
-                )
-                trace_obs, trace_actions = traces.pairs(env)
+                length = math.ceil(cfg.backtracking.trace_length / cfg.action_repeat)
+                traces = recall_traces(learner.backtracking, env, seeds.states, seeds.goals, length)
+                trace_obs, trace_actions = to_imitate(learner, env, traces, cfg).lesson(env)
                 every = max(1, ranks.size() * len(obs) // KL_SAMPLE)
                 rows = torch.arange(0, ranks.size() * len(obs), every)
                 imitated = learner.imitation.update(
@@ -213,10 +213,12 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
                     measured, by_mean, steps = coverage(
                         test_env, policy, test_goals, cfg.coverage.rollouts, noise["evaluation"]
                     )
-                learner.steps["eval"] += steps
+                    checked = consistency(test_env, traces)
+                learner.steps["eval"] += steps + checked.steps
                 learner.next_coverage = learner.steps["train"] + cfg.coverage.every
                 covered = float(measured.mean())
                 evaluation = {"coverage": covered, "coverage_deterministic": by_mean.mean()}
+                beside.metrics |= group("backtracking", checked.metrics())
             with clock.measure("learning"):
                 beside.wait("gan")
                 if measure or ranks.size() > 1:  # else the value function has until the next batch
@@ -245,6 +247,8 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
                     "curriculum/estimated_coverage": mean(estimate),
                     "backtracking/traces": traces.valid.shape[1],
                     "backtracking/valid": mean(traces.valid),
+                    "backtracking/decoded": len(seeds.goals) / len(wanted) if len(wanted) else 0,
+                    "backtracking/shift": mean(seeds.shift),
                 }
             )
             if measure:
@@ -298,6 +302,28 @@ def advantages_and_returns(
         cfg.discount,
         cfg.gae_lambda,
     )
+
+
+def most_valuable(learner: Learner, env: GoalEnv, n: int) -> Decoded:
+    """Of some experienced states the n of highest value for the goals that they led to (Goyal et
+    al. 2019, Algorithm 2, for states that are not generated)."""
+    states, goals = learner.transitions.sample(SEED_STATES, learner.rng)
+    obs = learner.policy.normaliser(torch.from_numpy(env.observations(states, goals)))
+    best = learner.value(obs).argsort(descending=True)[:n].numpy()
+    return Decoded(states[best], goals[best], np.zeros(len(best)))
+
+
+def to_imitate(learner: Learner, env: GoalEnv, traces: RecallTraces, cfg: Config) -> Steps:
+    """The steps of recall traces, or what a control imitates in their place."""
+    data, rng, relabel = learner.transitions, learner.rng, cfg.imitation.relabel
+    most, length = cfg.backtracking.traces, len(traces.valid)
+    if learner.forward is not None:
+        states, goals = data.sample(most, rng)
+        noise = learner.noise["imitation"]
+        return imagine(learner.forward, learner.policy, env, states, goals, length, noise)
+    if cfg.imitation.source == "successes":
+        return data.last_steps(env, most * length, length, relabel, rng)
+    return traces.steps(env, relabel, rng)
 
 
 def finished(cfg: Config, learner: Learner, seconds: float) -> float:

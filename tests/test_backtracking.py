@@ -9,7 +9,9 @@ from goalgan_bt import envs
 from goalgan_bt.backtracking import (
     BacktrackingConfig,
     BacktrackingModel,
+    RecallTraces,
     Transitions,
+    consistency,
     recall_traces,
 )
 from goalgan_bt.decoder import decode
@@ -19,10 +21,16 @@ def fitted(states, actions, next_states, steps=1500, **settings):
     torch.manual_seed(0)
     cfg = BacktrackingConfig(steps=steps, hidden=(64, 64), min_transitions=1, **settings)
     dims = states.shape[1], actions.shape[1]
-    model = BacktrackingModel(*dims, cfg, torch.Generator().manual_seed(0))
-    data = Transitions(*dims, cfg)
-    data.add(states, actions, next_states)
+    model = BacktrackingModel(*dims, 2, cfg, torch.Generator().manual_seed(0))
+    data = Transitions(*dims, 2, cfg)
+    data.add(*episode(states, actions, next_states))
     return model, model.fit(data)
+
+
+def episode(states, actions, next_states):
+    """Those transitions as one episode towards goals of zero."""
+    n = len(states)
+    return states, actions, next_states, np.zeros((n, 2), np.float32), np.arange(n)[::-1]
 
 
 def linear_walk(n=20_000, seed=0):
@@ -38,7 +46,7 @@ def test_it_recovers_the_reverse_of_a_linear_gaussian_walk():
     model, _ = fitted(*linear_walk())
     torch.manual_seed(1)
     following = torch.tensor([[1.0, -0.5]]).repeat(4000, 1)
-    before, actions = model.predecessors(following)
+    before, actions = model.predecessors(following, torch.zeros(4000, 2))
     # Given a, s = s' - 0.5 a up to N(0, 0.1^2) (and a slight pull to the prior).
     error = (before - (following - 0.5 * actions)).numpy()
     assert np.abs(error.mean(axis=0)).max() < 0.05
@@ -68,7 +76,8 @@ def test_negative_log_likelihood_by_hand():
     state = -torch.distributions.Normal(mean, (0.5 * log_var).exp()).log_prob(delta).mean()
     acted = by_torch(nets[1], nets[1].flat, s)
     action = -torch.distributions.Normal(acted, 1.0).log_prob(a).mean()
-    ours = model.negative_log_likelihood(following, actions, states - following)
+    goals = torch.zeros(50, 2)
+    ours = model.negative_log_likelihood(following, actions, states - following, goals)
     assert ours == pytest.approx((action.item(), state.item()), rel=1e-5)
     gradients = torch.autograd.grad(action + state, [net.flat for net in nets])
     for net, gradient in zip(nets, gradients, strict=True):
@@ -77,24 +86,26 @@ def test_negative_log_likelihood_by_hand():
 
 def test_too_few_transitions_train_nothing():
     cfg = BacktrackingConfig(min_transitions=50)
-    data = Transitions(2, 2, cfg)
-    model = BacktrackingModel(2, 2, cfg, torch.Generator())
-    data.add(*(x[:49] for x in linear_walk(49)))
+    data = Transitions(2, 2, 2, cfg)
+    model = BacktrackingModel(2, 2, 2, cfg, torch.Generator())
+    data.add(*episode(*linear_walk(49)))
     assert model.fit(data) == {}
-    assert len(data.sample_states(10, np.random.default_rng(0))) == 0
-    data.add(*(x[:1] for x in linear_walk(1)))
+    assert [len(rows) for rows in data.sample(10, np.random.default_rng(0))] == [0, 0]
+    data.add(*episode(*linear_walk(1)))
     assert set(model.fit(data)) == {"action_nll", "state_nll"}
 
 
 def test_the_ring_keeps_the_newest():
-    data = Transitions(1, 1, BacktrackingConfig(buffer=5, min_transitions=1))
+    data = Transitions(1, 1, 1, BacktrackingConfig(buffer=5, min_transitions=1))
     for i in range(0, 8, 2):
         rows = np.array([[i], [i + 1]], dtype=np.float32)
-        data.add(rows, rows, rows)
-    assert data.size == 5
+        data.add(rows, rows, rows, rows, rows[:, 0])
+    assert data.size == 5 and data.added == 8
     assert sorted(data.states[:, 0]) == [3, 4, 5, 6, 7]
+    assert data.states[data.newest(3), 0].tolist() == [5, 6, 7]
+    assert data.left[data.newest(9)].tolist() == [3, 4, 5, 6, 7]
     rows = np.arange(20, dtype=np.float32)[:, None]
-    data.add(rows, rows, rows)
+    data.add(rows, rows, rows, rows, rows[:, 0])
     assert sorted(data.actions[:, 0]) == [15, 16, 17, 18, 19]
 
 
@@ -122,25 +133,19 @@ def test_traces_lead_to_their_goal_in_the_real_maze():
     goals = env.maze.sample_free(100, np.random.default_rng(1))
     goals = goals[np.linalg.norm(goals, axis=1) < 1.5]
     seeds = decode(env, goals, following[::50].astype(float), 0.3, np.random.default_rng(0))
-    traces = recall_traces(model, env, *seeds, length=20)
+    traces = recall_traces(model, env, seeds.states, seeds.goals, length=20)
     n = len(seeds.goals)
     assert n > 5 and traces.states.shape == (20, n, 4)
     assert np.allclose(env.achieved_goals(traces.seeds), traces.goals)
-    ids = np.arange(n)
-    arrives = traces.seeds
-    for t in range(20):
-        valid = traces.valid[t]
-        env.reset(ids, np.zeros((n, 2)), np.where(valid[:, None], traces.states[t], traces.seeds))
-        real = env.step(ids, traces.actions[t]).states
-        if valid.any():
-            gap = np.linalg.norm(real - arrives, axis=1)[valid]
-            assert np.median(gap) < 0.05
-        arrives = traces.states[t]
+    found = consistency(env, traces)
+    assert np.array_equal(np.isfinite(found.gap), traces.valid)
+    assert np.nanmedian(found.gap, axis=1).max() < 0.02
+    assert traces.valid.sum() < found.steps <= 2 * traces.valid.sum()
     assert traces.valid[0].mean() > 0.8
     # Once invalid, always invalid; and a valid state stands in free space.
     assert not (traces.valid[1:] & ~traces.valid[:-1]).any()
     assert env.maze.is_free(traces.states[traces.valid][:, :2]).all()
-    obs, trace_actions = traces.pairs(env)
+    obs, trace_actions = traces.steps(env, False, np.random.default_rng(0)).lesson(env)
     assert len(obs) == len(trace_actions) == traces.valid.sum()
     offset = traces.goals - traces.states[0, :, :2]
     first = traces.valid[0].sum()
@@ -152,11 +157,16 @@ def test_traces_lead_to_their_goal_in_the_real_maze():
 def test_no_seeds_no_traces():
     env = envs.make("ant_umaze", 1)
     cfg = BacktrackingConfig()
-    model = BacktrackingModel(env.state_dim, env.act_dim, cfg, torch.Generator())
+    model = BacktrackingModel(env.state_dim, env.act_dim, 2, cfg, torch.Generator())
     nothing = np.empty((0, env.state_dim)), np.empty((0, 2))
     for length in (0, 5):
         traces = recall_traces(model, env, *nothing, length)
-        obs, actions = traces.pairs(env)
+        rng = np.random.default_rng(0)
+        for relabel in (False, True):
+            obs, actions = traces.steps(env, relabel, rng).lesson(env)
+            assert obs.shape == (0, env.obs_dim) and actions.shape == (0, env.act_dim)
+        assert consistency(env, traces).metrics() == {}
+        obs, actions = traces.steps(env, False, rng).lesson(env)
         assert obs.shape == (0, env.obs_dim) and actions.shape == (0, env.act_dim)
         assert traces.paths(env).shape == (length, 0, 2)
 
@@ -169,3 +179,111 @@ def test_ant_traces_have_unit_quaternions():
     traces = recall_traces(model, env, seeds, env.achieved_goals(seeds), length=10)
     assert np.allclose(np.linalg.norm(traces.states[..., 3:7], axis=-1), 1.0)
     assert np.abs(traces.actions).max() <= 1.0
+
+
+def test_consistency_by_hand():
+    """A trace made by the simulator itself has no gap and arrives; a shifted one has its shift."""
+    env = envs.make("point_umaze", 3, threads=1)
+    ids = np.arange(3)
+    env.reset(ids, np.zeros((3, 2)))
+    states, actions = [env.read_states(ids)], np.full((6, 3, 2), [1.0, 0.0])
+    for action in actions:
+        env.advance(ids, action)
+        states.append(env.read_states(ids))
+    states = np.array(states)
+    goals = env.achieved_goals(states[-1])
+    valid = np.ones((6, 3), bool)
+    valid[4:, 1] = False  # a trace that stopped early
+    backward = states[-2::-1].copy()
+    backward[:, 2, 1] += 0.5  # beside the others: the last step misses the goal by that much
+    traces = RecallTraces(backward, actions, valid, goals, states[-1])
+    found = consistency(env, traces)
+    assert found.gap[:, 0] == pytest.approx(np.zeros(6), abs=1e-9)
+    assert np.isnan(found.gap[4:, 1]).all() and found.gap[:4, 1].max() < 1e-9
+    assert found.gap[:, 2] == pytest.approx([0.5, 0, 0, 0, 0, 0], abs=1e-9)
+    assert found.arrived.tolist() == [True, True, False]
+    assert found.moved[0, 0] == pytest.approx(
+        np.linalg.norm(states[6] - states[5], axis=1)[0], abs=0.1
+    )
+    metrics = found.metrics()
+    assert metrics["arrived"] == pytest.approx(2 / 3)
+    assert metrics["gap"] == pytest.approx(0.5 / 16)
+
+
+def test_relabelled_steps_of_a_trace_lead_to_a_later_place_of_it():
+    env = envs.make("point_umaze", 1)
+    length, n = 5, 400
+    states = np.zeros((length, n, 4))
+    states[..., 0] = -np.arange(1, length + 1)[:, None]  # x = -1 just before the goal at 0
+    states[..., 1] = np.arange(n)  # tells the traces apart
+    goals = np.stack([np.zeros(n), np.arange(n)], axis=1)
+    valid = np.ones((length, n), bool)
+    traces = RecallTraces(states, np.zeros((length, n, 2)), valid, goals, states[0])
+    rng = np.random.default_rng(0)
+    plain, later = (traces.steps(env, relabel, rng) for relabel in (False, True))
+    assert (plain.goals[:, 0] == 0).all()
+    assert np.array_equal(later.goals[:, 1], later.states[:, 1])  # of the same trace
+    ahead = later.goals[:, 0] - later.states[:, 0]
+    first = later.states[:, 0] == -length
+    assert ahead.min() == 1 and set(ahead[first]) == {1, 2, 3, 4, 5}
+
+
+def test_last_steps_of_real_successes():
+    env = envs.make("point_umaze", 1)
+    data = Transitions(4, 2, 2, BacktrackingConfig(buffer=12, min_transitions=1))
+    for episode_length, goal in ((7, 1.0), (6, 2.0)):  # the first one's head is overwritten
+        steps = np.arange(episode_length, dtype=np.float32)
+        states = np.stack([steps, np.full_like(steps, goal), 0 * steps, 0 * steps], axis=1)
+        after = states + np.array([1, 0, 0, 0])
+        goals = np.full((episode_length, 2), [episode_length, goal], np.float32)
+        data.add(states, np.zeros((episode_length, 2)), after, goals, steps[::-1])
+    rng = np.random.default_rng(0)
+    own = data.last_steps(env, 100, 3, False, rng)
+    assert sorted(map(tuple, own.states[:, :2])) == [(3, 2), (4, 1), (4, 2), (5, 1), (5, 2), (6, 1)]
+    assert set(map(tuple, own.goals)) == {(7, 1), (6, 2)}
+    for _ in range(20):
+        later = data.last_steps(env, 100, 12, True, rng)
+        assert len(later.states) == 12
+        ahead = later.goals - later.states[:, :2]
+        assert (ahead[:, 1] == 0).all() and ahead[:, 0].min() >= 1
+    assert len(data.last_steps(env, 4, 12, True, rng).states) == 4
+
+
+def test_a_conditioned_model_tells_goals_apart():
+    """The action depends on the goal alone: only the conditioned model can know it."""
+    rng = np.random.default_rng(0)
+    states = rng.normal(size=(4000, 2)).astype(np.float32)
+    goals = rng.choice([-1.0, 1.0], size=(4000, 2)).astype(np.float32)
+    losses = {}
+    for conditioned in (False, True):
+        cfg = BacktrackingConfig(steps=600, min_transitions=1, conditioned=conditioned)
+        torch.manual_seed(0)
+        model = BacktrackingModel(2, 2, 2, cfg, torch.Generator().manual_seed(0))
+        data = Transitions(2, 2, 2, cfg)
+        data.add(states, 0.5 * goals, states + 0.1, goals, np.zeros(4000))
+        losses[conditioned] = model.fit(data)["action_nll"]
+    assert losses[False] > 1.3 and losses[True] < 1.1  # floors: 1.42 and 0.92
+
+
+def test_held_out_likelihood_is_of_what_is_new():
+    states, actions, following = linear_walk(4000)
+    cfg = BacktrackingConfig(steps=300, min_transitions=1)
+    model = BacktrackingModel(2, 2, 2, cfg, torch.Generator().manual_seed(0))
+    data = Transitions(2, 2, 2, cfg)
+    data.add(*episode(states, actions, following))
+    assert "held_out_state_nll" not in model.fit(data)  # all is new
+    assert "held_out_state_nll" not in model.fit(data)  # nothing is
+    data.add(*episode(*linear_walk(500, seed=1)))
+    alike = model.fit(data)["held_out_state_nll"]
+    far = linear_walk(500, seed=2)
+    data.add(*episode(far[0] + 3, far[1], far[2] - 3))
+    assert model.fit(data)["held_out_state_nll"] > alike + 1
+
+
+def test_an_untrained_model_only_learns_the_scales():
+    states, actions, following = linear_walk(500)
+    before, _ = fitted(states, actions, following, steps=0)
+    torch.manual_seed(0)
+    fresh = BacktrackingModel(2, 2, 2, before.cfg, torch.Generator())
+    assert torch.equal(before.state_net.flat, fresh.state_net.flat)
+    assert not torch.equal(before.state_scale.std, fresh.state_scale.std)

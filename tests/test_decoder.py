@@ -25,10 +25,11 @@ def test_decoded_states_are_valid_experienced_and_on_their_goal(name):
     env, experienced = walked(name)
     rng = np.random.default_rng(1)
     goals = env.achieved_goals(experienced)[::200] + rng.normal(0, 0.02, (30, env.goal_dim))
-    states, decoded = decode(env, goals, experienced, 0.5, rng)
+    states, decoded, shift = decode(env, goals, experienced, 0.5, rng)
     assert len(states) == len(decoded) > 20
     assert np.allclose(env.achieved_goals(states), decoded)
     assert env.valid(states).all()
+    assert shift.shape == (len(states),) and (shift > 0).all() and shift.max() < 0.5
     # All but the place is a state that the agent has really had.
     fixed = [i for i in range(env.state_dim) if i >= env.goal_dim]
     gaps = np.abs(states[:, None][..., fixed] - experienced[..., fixed]).max(axis=2).min(axis=1)
@@ -38,7 +39,7 @@ def test_decoded_states_are_valid_experienced_and_on_their_goal(name):
 def test_goals_far_from_experience_or_in_walls_are_dropped():
     env, experienced = walked("ant_umaze")
     goals = np.array([[4.0, 4.0], [0.0, 1.5], [0.05, 0.0]])
-    _, decoded = decode(env, goals, experienced, 0.5, np.random.default_rng(0))
+    _, decoded, _ = decode(env, goals, experienced, 0.5, np.random.default_rng(0))
     assert decoded.tolist() == [[0.05, 0.0]]
 
 

@@ -9,13 +9,14 @@ from goalgan_bt.policy import GaussianPolicy, PolicyConfig
 from goalgan_bt.rollout import Collector, RolloutConfig
 
 
-def make(name="point_umaze", n=16, steps=40, chain=0.0, horizon=25, seed=0):
+def make(name="point_umaze", n=16, steps=40, chain=0.0, horizon=25, seed=0, failures=False):
     torch.manual_seed(seed)
     env = envs.make(name, n, threads=1, horizon=horizon)
     policy = GaussianPolicy(env.obs_dim, env.act_dim, PolicyConfig(hidden=(8,), init_std=1.0))
     cfg = RolloutConfig(num_envs=n, steps=steps, chain=chain)
     noise = torch.Generator().manual_seed(seed)
-    return env, policy, Collector(env, cfg, np.random.default_rng(seed), noise)
+    rng = np.random.default_rng(seed)
+    return env, policy, Collector(env, cfg, rng, noise, failures)
 
 
 NEAR = np.array([[0.35, 0.0], [0.0, 0.4], [-0.4, 0.0]])
@@ -91,6 +92,19 @@ def test_episodes_are_complete_and_their_transitions_real():
     twin.reset(ids, np.zeros((len(ids), 2)), states.astype(float))
     real = twin.step(ids, actions).states
     assert np.allclose(real, following, atol=1e-4)
+
+
+def test_failures_are_kept_where_they_are_wanted_but_falls_never():
+    env, policy, collector = make("ant_umaze", n=32, steps=150, horizon=100, failures=True)
+    collector.begin(np.array([[4.0, 4.0]]))
+    rollouts, episodes = collector.collect(policy, np.array([[4.0, 4.0]]))
+    fell = rollouts.terminated & (rollouts.rewards == 0)
+    assert fell.sum() == (~episodes.kept).sum() > 0 and not episodes.success.any()
+    assert episodes.kept.sum() == rollouts.truncated.sum() > 0
+    lengths = episodes.lengths[episodes.kept]
+    assert len(episodes.states) == lengths.sum()
+    last = episodes.next_states[np.cumsum(lengths) - 1].astype(float)
+    assert np.allclose(env.achieved_goals(last), episodes.ends[episodes.kept], atol=1e-4)
 
 
 def test_chained_episodes_begin_where_the_last_one_ended():

@@ -1,0 +1,210 @@
+"""What a study shows: interquartile means over seeds, bootstrap intervals, times to thresholds.
+
+Statistics as in Agarwal et al. 2021 ("Deep RL at the edge of the statistical precipice"): the
+interquartile mean, and percentile intervals of 95% from resampling the seeds of each environment
+and method (environments are never mixed, so that is their stratified bootstrap).
+"""
+
+import io
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy import stats
+
+from goalgan_bt import record
+from goalgan_bt.envs.maze import FloatArray
+from goalgan_bt.viz.published import published
+
+if TYPE_CHECKING:
+    from goalgan_bt.study import Study, Tables
+
+THRESHOLDS = (0.3, 0.48, 0.63, 0.9)  # coverage; 0.48 and 0.63 are Goyal et al. 2019's
+REFERENCES = ("goal_gan", "self_imitation")  # whom times are compared with
+RESAMPLES = 5000
+
+
+class Curve(NamedTuple):
+    """One run: steps (n,) of training, coverage (n,) measured there; both begin with 0."""
+
+    steps: FloatArray
+    coverage: FloatArray
+
+
+class Interval(NamedTuple):
+    """An estimate and its 95% interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.value:.2f} [{self.low:.2f}, {self.high:.2f}]"
+
+
+def iqm(x: FloatArray, axis: int = 0) -> NDArray[np.float64]:
+    """Interquartile mean: the mean without the lowest and the highest quarter."""
+    return np.asarray(stats.trim_mean(x, 0.25, axis=axis))
+
+
+def interval(x: FloatArray, statistic: Callable[..., FloatArray] = iqm) -> Interval:
+    """A statistic of a sample (n,) and its bootstrap interval; NaN bounds for a single value."""
+    if len(x) < 2:
+        return Interval(float(statistic(x)), np.nan, np.nan)
+    rows = np.random.default_rng(0).integers(len(x), size=(RESAMPLES, len(x)))
+    low, high = np.percentile(statistic(x[rows], axis=1), [2.5, 97.5])
+    return Interval(float(statistic(x)), float(low), float(high))
+
+
+def time_to(curve: Curve, threshold: float) -> float:
+    """Steps at which the line through the reports first reaches a coverage; infinite if never."""
+    above = np.flatnonzero(curve.coverage >= threshold)
+    if len(above) == 0:
+        return np.inf
+    i = max(1, above[0])
+    (x0, x1), (y0, y1) = curve.steps[i - 1 : i + 1], curve.coverage[i - 1 : i + 1]
+    return float(x0 + (x1 - x0) * (threshold - y0) / (y1 - y0))
+
+
+def area(curve: Curve) -> float:
+    """Mean coverage over the run."""
+    return float(np.trapezoid(curve.coverage, curve.steps) / curve.steps[-1])
+
+
+def ratio(ours: list[Curve], theirs: list[Curve], threshold: float) -> tuple[Interval, int]:
+    """Time to a threshold over another method's, seed by seed: the geometric mean with its
+    interval, and how many of all runs reached it. One that did not counts with all its steps,
+    which is too little: with few that did, the ratio says little."""
+    times = np.array(
+        [
+            [min(time_to(curve, threshold), curve.steps[-1]) for curve in pair]
+            for pair in zip(ours, theirs, strict=True)
+        ]
+    )
+    reached = sum(np.isfinite(time_to(curve, threshold)) for curve in [*ours, *theirs])
+    logs = interval(np.log(times[:, 0] / times[:, 1]), np.mean)
+    return Interval(*np.exp(logs)), int(reached)
+
+
+def curves(tables: "Tables") -> dict[tuple[str, str], dict[int, Curve]]:
+    """The runs by environment and method, then by seed."""
+    points: dict[tuple[str, str, int], list[tuple[float, float]]] = {}
+    for row in tables.curves:
+        key = row["env"], row["method"], int(row["seed"])
+        points.setdefault(key, [(0.0, 0.0)]).append((float(row["steps"]), float(row["coverage"])))
+    runs: dict[tuple[str, str], dict[int, Curve]] = {}
+    for (env, method, seed), rows in sorted(points.items()):
+        runs.setdefault((env, method), {})[seed] = Curve(*np.array(rows).T)
+    return runs
+
+
+def report(study: "Study", tables: "Tables") -> None:
+    """Write README.md, summary.csv and curves.png beside the tables of a study."""
+    runs, rows = curves(tables), []
+    text = [f"# Study {study.name}", "", f"From `python -m goalgan_bt.study {study.name}`."]
+    envs = [env for env in study.envs if any(key[0] == env for key in runs)]
+    for env in envs:
+        of = {method: runs[env, method] for method in study.methods if (env, method) in runs}
+        rows += [_row(env, method, seeds, tables) for method, seeds in of.items()]
+        rows_here = sorted(rows[-len(of) :], key=lambda row: -float(row["area"].split()[0]))
+        text += ["", f"## {env}", "", *_markdown(rows_here), "", *_ratios(of)]
+    text += [
+        "",
+        "Interquartile means over seeds with 95% bootstrap intervals. `area`: mean coverage over",
+        "the run. `to 0.63`: median of the training steps (millions) until coverage first reaches",
+        "0.63, on lines between reports; runs that never do count as infinite. Steps in millions",
+        "and wall time (one core) are means per run. Raw figures: runs.csv, costs.csv.",
+        "",
+        "![coverage over training steps](curves.png)",
+        "",
+    ]
+    record.write_table(tables.folder / "summary.csv", list(rows[0]), rows)
+    (tables.folder / "README.md").write_text("\n".join(text))
+    picture = io.BytesIO()
+    draw(envs, runs, list(study.methods)).savefig(picture, dpi=130)
+    record.write_atomically(
+        tables.folder / "curves.png", lambda file: file.write(picture.getvalue())
+    )
+
+
+def _row(env: str, method: str, seeds: dict[int, Curve], tables: "Tables") -> dict[str, str]:
+    of = list(seeds.values())
+    costs = [row for row in tables.costs if (row["env"], row["method"]) == (env, method)]
+    row = {
+        "env": env,
+        "method": method,
+        "seeds": str(len(of)),
+        "area": str(interval(np.array([area(curve) for curve in of]))),
+        "at the end": str(interval(np.array([curve.coverage[-1] for curve in of]))),
+    }
+    for threshold in THRESHOLDS:
+        median = np.median([time_to(curve, threshold) for curve in of]) / 1e6
+        row[f"to {threshold:g}"] = f"{median:.2f}" if np.isfinite(median) else "-"
+    for kind in ("train", "label", "eval"):
+        row[f"{kind} steps"] = f"{np.mean([float(cost[kind]) for cost in costs]) / 1e6:.1f}"
+    row["wall s"] = f"{np.mean([float(cost['seconds']) for cost in costs]):.0f}"
+    return row
+
+
+def _markdown(rows: list[dict[str, str]]) -> list[str]:
+    names = [name for name in rows[0] if name != "env"]
+    lines = [f"| {' | '.join(names)} |", "|" + " --- |" * len(names)]
+    return lines + [f"| {' | '.join(row[name] for name in names)} |" for row in rows]
+
+
+def _ratios(of: dict[str, dict[int, Curve]]) -> list[str]:
+    lines = []
+    for reference in REFERENCES:
+        for method in of:
+            seeds = sorted(set(of[method]) & set(of.get(reference, {})))
+            if method == reference or not seeds:
+                continue
+            cells = []
+            for threshold in THRESHOLDS:
+                ours, theirs = ([of[name][seed] for seed in seeds] for name in (method, reference))
+                value, reached = ratio(ours, theirs, threshold)
+                cells.append(f"{value} ({reached}/{2 * len(seeds)})")
+            lines.append(f"| {method} over {reference} | {len(seeds)} | {' | '.join(cells)} |")
+    if not lines:
+        return []
+    heads = " | ".join(f"{threshold:g}" for threshold in THRESHOLDS)
+    return [
+        "Time to a coverage over that of another method, paired by seed (geometric mean, 95%",
+        "interval; in brackets how many of all runs reached it, the others counting with all their",
+        "steps):",
+        "",
+        f"| times | seeds | {heads} |",
+        "|" + " --- |" * (len(THRESHOLDS) + 2),
+        *lines,
+    ]
+
+
+def draw(
+    envs: list[str], runs: dict[tuple[str, str], dict[int, Curve]], methods: list[str]
+) -> Figure:
+    """Coverage over training steps: interquartile mean and interval per method, a panel per
+    environment, with what was published."""
+    figure = Figure(figsize=(7.5 * len(envs), 5), layout="constrained")
+    for ax, env in zip(figure.subplots(1, len(envs), squeeze=False)[0], envs, strict=True):
+        for i, method in enumerate(methods):
+            of = list(runs.get((env, method), {}).values())
+            if not of:
+                continue
+            grid = np.linspace(0, min(curve.steps[-1] for curve in of), 60)
+            y = np.array([np.interp(grid, *curve) for curve in of])
+            bounds = np.array([interval(column) for column in y.T])
+            style = dict(color=f"C{i % 10}", linestyle="-" if i < 10 else "--")
+            ax.plot(grid / 1e6, bounds[:, 0], label=f"{method} ({len(of)})", **style)
+            ax.fill_between(grid / 1e6, *bounds[:, 1:].T, color=style["color"], alpha=0.12, lw=0)
+        for line in published({"env": env}):
+            steps, level = line.last
+            name = f"{line.method}, published, {steps / 1e6:.0f}M steps"
+            ax.axhline(level, color="0.6", lw=0.8, ls=":")
+            ax.text(0, level, name, fontsize=7, color="0.4", va="bottom")
+        ax.set(title=env, xlabel="million environment steps of training", ylim=(0, 1))
+        ax.set_ylabel("coverage")
+        ax.grid(alpha=0.25)
+        ax.legend(fontsize=7, frameon=False, loc="lower right")
+    return figure

@@ -1,0 +1,123 @@
+"""Other ways to propose goals than the GAN: what it is compared with.
+
+Florensa et al. 2018, section 5: the uniform distribution over the goal box, over the free space,
+and the rejection oracle; Portelas et al. 2019: ALP-GMM.
+"""
+
+import numpy as np
+import torch
+
+from goalgan_bt.command_line import UsageError
+from goalgan_bt.coverage import success_rate
+from goalgan_bt.envs.batch import GoalEnv
+from goalgan_bt.envs.maze import BoolArray, FloatArray
+from goalgan_bt.goals import intermediate
+from goalgan_bt.policy import GaussianPolicy
+from goalgan_bt.settings import GoalsConfig
+
+
+def feasible(env: GoalEnv, n: int, rng: np.random.Generator) -> FloatArray:
+    """Uniform goals in the free space, (n, goal_dim)."""
+    goals = np.empty((0, env.goal_dim))
+    while len(goals) < n:
+        drawn = rng.uniform(env.goal_low, env.goal_high, (4 * n, env.goal_dim))
+        goals = np.concatenate([goals, drawn[env.feasible(drawn)]])
+    return goals[:n]
+
+
+def oracle(
+    env: GoalEnv,
+    policy: GaussianPolicy,
+    cfg: GoalsConfig,
+    rng: np.random.Generator,
+    noise: torch.Generator,
+) -> tuple[FloatArray, int]:
+    """Uniform free goals of which fresh episodes of the policy show intermediate difficulty.
+
+    Args:
+        env: simulations for this purpose.
+        policy: pi.
+        cfg: how many to try; what intermediate means.
+        rng: draws goals.
+        noise: draws actions.
+
+    Returns:
+        Goals, (n <= cfg.new, goal_dim), all that were tried if none is intermediate; and the
+        environment steps spent.
+    """
+    goals = feasible(env, cfg.new, rng)
+    success, steps = success_rate(env, policy, goals, cfg.label_rollouts or 3, noise)
+    good = intermediate(success, cfg.r_min, cfg.r_max)
+    return goals[good] if good.any() else goals, steps
+
+
+class AlpGmm:
+    """Absolute learning progress with Gaussian mixtures (Portelas et al. 2019).
+
+    The progress at a goal is the change of outcome since the nearest goal that was tried before.
+    Every `WINDOW` episodes a mixture is fitted to their (goal, progress); goals are drawn from its
+    Gaussians in proportion to their mean progress, one in five uniformly.
+
+    Args:
+        low, high: (goal_dim,) the goal box, metres.
+        rng: draws goals.
+
+    Raises:
+        UsageError: without scikit-learn (extra `study`).
+    """
+
+    WINDOW = 250  # episodes
+    COMPONENTS = range(2, 11)
+    UNIFORM = 0.2
+
+    def __init__(self, low: FloatArray, high: FloatArray, rng: np.random.Generator) -> None:
+        try:
+            from sklearn.mixture import GaussianMixture
+            from sklearn.neighbors import KDTree
+        except ImportError:
+            raise UsageError(
+                'alp_gmm needs scikit-learn: pip install "goalgan_bt[study]"'
+            ) from None
+        self._mixture, self._tree = GaussianMixture, KDTree
+        self._low, self._high, self._rng = low, high, rng
+        self._goals, self._success = np.empty((0, len(low))), np.empty(0)
+        self._recent, self._outcomes = self._goals, self._success  # not yet in a mixture
+        self._fitted = None
+
+    def add(self, goals: FloatArray, success: BoolArray) -> None:
+        """Take in finished episodes, (n, goal_dim), (n,); fits when there are enough."""
+        self._recent = np.concatenate([self._recent, goals])
+        self._outcomes = np.concatenate([self._outcomes, success])
+        if len(self._recent) < self.WINDOW:
+            return
+        if len(self._goals):
+            nearest = self._tree(self._goals).query(self._recent, return_distance=False)[:, 0]
+            progress = np.abs(self._outcomes - self._success[nearest])
+            self._fit(np.column_stack([self._recent, progress])[-self.WINDOW :])
+        self._goals = np.concatenate([self._goals, self._recent])
+        self._success = np.concatenate([self._success, self._outcomes])
+        self._recent, self._outcomes = self._recent[:0], self._outcomes[:0]
+
+    def _fit(self, points: FloatArray) -> None:
+        seed = int(self._rng.integers(2**31))
+        mixtures = [
+            self._mixture(k, reg_covar=1e-4, init_params="random_from_data", random_state=seed).fit(
+                points
+            )
+            for k in self.COMPONENTS
+        ]
+        self._fitted = min(mixtures, key=lambda mixture: mixture.aic(points))
+
+    def sample(self, n: int) -> FloatArray:
+        """Goals in the box, (n, goal_dim)."""
+        goals = self._rng.uniform(self._low, self._high, (n, len(self._low)))
+        if self._fitted is None:
+            return goals
+        progress = np.maximum(self._fitted.means_[:, -1], 1e-6)
+        chosen = self._rng.choice(len(progress), n, p=progress / progress.sum())
+        dim = len(self._low)
+        for i in np.flatnonzero(self._rng.random(n) >= self.UNIFORM):
+            k = chosen[i]
+            covariance = self._fitted.covariances_[k][:dim, :dim]
+            goals[i] = self._rng.multivariate_normal(self._fitted.means_[k, :dim], covariance)
+        return np.clip(goals, self._low, self._high)

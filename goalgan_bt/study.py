@@ -1,0 +1,305 @@
+"""Studies: methods against each other, many seeds, one table and one report.
+
+    python -m goalgan_bt.study point_umaze
+
+A study is a small TOML file: environments, a number of seeds, flags for all, and methods by name,
+each with the flags of `goalgan_bt.train` that make it. Every run is a process of one thread. What
+is finished stands in `runs.csv` and is not run again; what was cut off goes on from its checkpoint.
+"""
+
+import os
+import signal
+import sys
+
+if __name__ == "__main__":  # nothing is lost: what is finished is on disk, the rest goes on
+    signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+
+import csv
+import shlex
+import subprocess
+import time
+import tomllib
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import tyro
+
+from goalgan_bt import config, record
+from goalgan_bt.command_line import UsageError, parse
+from goalgan_bt.progress import complain, say
+
+SHIPPED = Path(__file__).parent / "studies"
+CURVES = ("env", "method", "seed", "steps", "coverage")  # columns of runs.csv, a row per report
+COSTS = ("env", "method", "seed", "flags", "commit", "train", "label", "eval", "seconds")
+
+
+class Study(NamedTuple):
+    """name: of the file; envs, methods (name -> flags), seeds (from 0 on): the grid; flags: of
+    all."""
+
+    name: str
+    envs: list[str]
+    methods: dict[str, str]
+    seeds: int
+    flags: str
+
+
+class Run(NamedTuple):
+    """One run of a study: env, method, seed and the flags that make it."""
+
+    env: str
+    method: str
+    seed: int
+    flags: str
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """What tells it from the study's others, as in the tables."""
+        return self.env, self.method, str(self.seed)
+
+
+@dataclass(frozen=True)
+class StudyConfig:
+    """Run a study, or what is missing of it, and write its tables, report and picture."""
+
+    study: tyro.conf.Positional[str]
+    """A TOML file, or one of those that come along: point_umaze, ant_umaze, ablations."""
+    out: Path = Path("docs/studies")
+    """Where tables and report go, in a folder with the study's name."""
+    runs: Path = Path("runs/studies")
+    """Where the run folders go."""
+    processes: int = 0
+    """Runs at a time; 0 is one per core."""
+    engine: Literal["here", "submitit"] = "here"
+    """Where runs run: on this machine, or as jobs of a SLURM cluster (submitit, extra `study`;
+    where there is no SLURM it uses this machine)."""
+    partition: str | None = None
+    """SLURM partition for submitit."""
+    report: bool = False
+    """Only write the report of what is there."""
+
+
+def load(name: str) -> Study:
+    """A study by file or by the name of one that comes along.
+
+    Raises:
+        UsageError: if there is none, or it cannot be read; the message says what is wrong.
+    """
+    path = Path(name) if name.endswith(".toml") else SHIPPED / f"{name}.toml"
+    try:
+        table = tomllib.loads(path.read_text())
+    except FileNotFoundError:
+        known = ", ".join(sorted(file.stem for file in SHIPPED.glob("*.toml")))
+        raise UsageError(
+            f"there is no study {name!r}: name a TOML file or one of {known}"
+        ) from None
+    except (OSError, ValueError) as error:
+        raise UsageError(f"cannot read {path}: {error}") from None
+    wrong = f"{path} is no study: "
+    kinds: dict[str, type] = {"envs": list, "seeds": int, "methods": dict}
+    for key, kind in kinds.items():
+        if not isinstance(table.get(key), kind) or not table[key]:
+            raise UsageError(f"{wrong}it needs {key} (envs = [...], seeds = 5, [methods])")
+    if unknown := set(table) - {*kinds, "flags"}:
+        raise UsageError(f"{wrong}it has an unknown key {unknown.pop()!r}")
+    flags = table.get("flags", "")
+    texts = [*table["envs"], *table["methods"].values(), flags]
+    if not all(isinstance(text, str) for text in texts) or table["seeds"] < 1:
+        raise UsageError(f"{wrong}environments and flags are texts, seeds a number from 1 on")
+    study = Study(path.stem, table["envs"], table["methods"], table["seeds"], flags)
+    for run in grid(study):
+        try:
+            config.from_command_line(words(run))
+        except UsageError as error:
+            raise UsageError(f"{wrong}{run.env}, {run.method}: {error}") from None
+    return study
+
+
+def grid(study: Study) -> list[Run]:
+    """Every run of a study, seed by seed, so that all methods have as many at any time."""
+    return [
+        Run(env, method, seed, f"{study.flags} {flags}".strip())
+        for seed in range(study.seeds)
+        for env in study.envs
+        for method, flags in study.methods.items()
+    ]
+
+
+def words(run: Run) -> list[str]:
+    """The flags of `goalgan_bt.train` for a run."""
+    common = ["--env", run.env, "--seed", str(run.seed), "--threads", "1", "--viz", "none"]
+    return common + shlex.split(run.flags)
+
+
+def perform(run: Run, folder: Path) -> Path:
+    """Train in a process of its own, or go on with what was cut off.
+
+    Args:
+        run: what to train.
+        folder: of this run alone; its run folder is made in it.
+
+    Returns:
+        The run folder.
+
+    Raises:
+        RunError: if training failed, with its last words.
+    """
+    flags = [*words(run), "--out", str(folder)]
+    if begun := sorted(folder.glob("*/checkpoint.pt")):
+        ended = begun[-1].with_name(record.ENDED)
+        if ended.exists() and ended.read_text().startswith("complete"):
+            return ended.parent
+        flags = ["--resume", str(ended.parent), "--viz", "none"]
+    folder.mkdir(parents=True, exist_ok=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "goalgan_bt.train", *flags],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    if done.returncode != 0:
+        last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
+        raise record.RunError(f"{run.env}, {run.method}, seed {run.seed} failed: {last}")
+    return sorted(folder.glob("*/checkpoint.pt"))[-1].parent
+
+
+class Tables:
+    """`runs.csv` and `costs.csv` of a study.
+
+    Args:
+        folder: where they are or shall be.
+
+    Attributes:
+        curves, costs: their rows.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+        self.curves = _read(folder / "runs.csv", CURVES)
+        self.costs = _read(folder / "costs.csv", COSTS)
+
+    def has(self, run: Run) -> bool:
+        """Whether a run is finished.
+
+        Raises:
+            UsageError: if it was made with other flags.
+        """
+        for row in self.costs:
+            if (row["env"], row["method"], row["seed"]) == run.key:
+                if row["flags"] != run.flags:
+                    raise UsageError(
+                        f"{self.folder} holds {run.method} of {run.env} with the flags "
+                        f"{row['flags']!r}, not {run.flags!r}: rename the method or the study"
+                    )
+                return True
+        return False
+
+    def add(self, run: Run, folder: Path) -> float:
+        """Take in a finished run; its last coverage."""
+        _, rows = record.read_metrics(folder)
+        key = dict(zip(CURVES, run.key, strict=False))
+        reports = [row for row in rows if row.get("eval/coverage")]
+        self.curves += [
+            key | {"steps": row["steps/train"], "coverage": row["eval/coverage"]} for row in reports
+        ]
+        last = rows[-1]
+        self.costs.append(
+            key
+            | {"flags": run.flags, "commit": record.read_meta(folder)["commit"] or ""}
+            | {kind: last[f"steps/{kind}"] for kind in ("train", "label", "eval")}
+            | {"seconds": f"{float(last['time/total']):.0f}"}
+        )
+        record.write_table(self.folder / "runs.csv", CURVES, self.curves)
+        record.write_table(self.folder / "costs.csv", COSTS, self.costs)
+        return float(reports[-1]["eval/coverage"])
+
+
+def _read(path: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    if any(set(row) != set(columns) or None in row.values() for row in rows):
+        raise record.RunError(f"{path} is damaged: its columns must be {', '.join(columns)}")
+    return rows
+
+
+def finished(
+    cfg: StudyConfig, runs: list[Run], folder: Path
+) -> Iterator[tuple[Run, "Future[Path]"]]:
+    """Perform runs, several at a time; gives each as it ends."""
+    places = [folder / run.env / f"{run.method}-s{run.seed}" for run in runs]
+    if cfg.engine == "here":
+        with ThreadPoolExecutor(cfg.processes or len(os.sched_getaffinity(0))) as pool:
+            jobs: dict[Any, Run] = {
+                pool.submit(perform, run, place): run
+                for run, place in zip(runs, places, strict=True)
+            }
+            for job in as_completed(jobs):
+                yield jobs[job], job
+        return
+    try:
+        import submitit
+    except ImportError:
+        raise UsageError('submitit is missing: pip install "goalgan_bt[study]"') from None
+    executor = submitit.AutoExecutor(folder=folder / "submitit")
+    slurm = {} if cfg.partition is None else {"slurm_partition": cfg.partition}
+    limits = {} if not cfg.processes else {"slurm_array_parallelism": cfg.processes}
+    executor.update_parameters(cpus_per_task=1, timeout_min=24 * 60, **slurm, **limits)
+    jobs = dict(zip(executor.map_array(perform, runs, places), runs, strict=True))
+    for job in submitit.helpers.as_completed(list(jobs)):
+        yield jobs[job], job
+
+
+def main() -> int:
+    """The command line; returns the exit code."""
+    try:
+        cfg = parse(StudyConfig, None, "python -m goalgan_bt.study")
+        if cfg.processes < 0:
+            raise UsageError(f"--processes must be 0 or more, not {cfg.processes}")
+        try:
+            from goalgan_bt import evidence
+        except ImportError:
+            raise UsageError(
+                'the report needs matplotlib and scipy: pip install "goalgan_bt[study]"'
+            ) from None
+        study = load(cfg.study)
+        tables = Tables(cfg.out / study.name)
+        missing = [run for run in grid(study) if not tables.has(run)]
+        failed = 0
+        if missing and not cfg.report:
+            say(f"{study.name}: {len(missing)} runs of {len(grid(study))} to go")
+            began = time.monotonic()
+            places = cfg.runs / study.name
+            for i, (run, job) in enumerate(finished(cfg, missing, places), 1):
+                try:
+                    coverage = tables.add(run, job.result())
+                except record.RunError as error:
+                    failed += 1
+                    complain(str(error))
+                    continue
+                left = (time.monotonic() - began) / i * (len(missing) - i) / 60
+                say(
+                    f"{time.strftime('%H:%M:%S')} {i}/{len(missing)} {run.env} {run.method} "
+                    f"s{run.seed}: coverage {coverage:.3f}  left {left:.0f} min"
+                )
+        if not tables.costs:
+            raise UsageError(f"{tables.folder} holds no finished run yet: run the study first")
+        evidence.report(study, tables)
+        say(str(tables.folder / "README.md"))
+        if failed:
+            complain(f"{failed} runs failed: the same command tries them again")
+            return 2
+    except (UsageError, record.RunError, OSError) as error:
+        complain(str(error))
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,59 @@
+"""The forward model on a system that is known, and what it imagines."""
+
+import numpy as np
+import torch
+
+from goalgan_bt import config, envs
+from goalgan_bt.backtracking import Transitions
+from goalgan_bt.forward import ForwardModel, imagine
+from goalgan_bt.learner import Learner
+from goalgan_bt.settings import BacktrackingConfig
+
+
+def test_it_recovers_a_linear_system():
+    rng = np.random.default_rng(0)
+    states = rng.normal(size=(5000, 3)).astype(np.float32)
+    actions = rng.uniform(-1, 1, (5000, 3)).astype(np.float32)
+    following = states + 0.5 * actions + rng.normal(0, 0.1, states.shape).astype(np.float32)
+    cfg = BacktrackingConfig(steps=2000, batch=256, min_transitions=1)
+    model = ForwardModel(3, 3, cfg, torch.Generator().manual_seed(0))
+    data = Transitions(3, 3, 2, cfg)
+    assert model.fit(data) == {}
+    data.add(states, actions, following, np.zeros((5000, 2)), np.zeros(5000))
+    assert set(model.fit(data)) == {"forward_nll"}
+    a = torch.full((3000, 3), 0.8)
+    error = model.successors(torch.zeros(3000, 3), a) - 0.4
+    assert error.mean(dim=0).abs().max() < 0.06
+    assert ((error.std(dim=0) - 0.1).abs() < 0.04).all()
+
+
+class Perfect:
+    """A model that is the simulator."""
+
+    def __init__(self, env):
+        self.env = env
+
+    def successors(self, states, actions):
+        ids = np.arange(len(states))
+        self.env.reset(ids, np.zeros((len(ids), 2)), states.double().numpy())
+        self.env.advance(ids, actions.double().numpy())
+        return torch.from_numpy(self.env.read_states(ids))
+
+
+def test_only_imagined_successes_are_kept():
+    env = envs.make("point_umaze", 200, threads=1)
+    policy = Learner(env, config.preset("point_umaze")).policy
+    rng = np.random.default_rng(0)
+    goals = rng.uniform(-0.9, 0.9, (200, 2))
+    states = np.zeros((200, 4))
+    noise = torch.Generator().manual_seed(0)
+    steps = imagine(Perfect(env), policy, env, states, goals, 25, noise)
+    told = {tuple(goal): steps.states[(steps.goals == goal).all(axis=1)] for goal in steps.goals}
+    assert 5 < len(told) < 200  # some wander onto their goal, some do not
+    for goal, path in told.items():
+        gaps = np.linalg.norm(path[:, :2] - goal, axis=1)
+        assert tuple(path[0, :2]) == (0, 0)
+        assert gaps[1:].min(initial=1) >= 0.3  # ends when it arrives
+        assert gaps[-1] < 1.0
+    nothing = imagine(Perfect(env), policy, env, states[:0], goals[:0], 5, noise)
+    assert len(nothing.states) == 0

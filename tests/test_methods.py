@@ -1,0 +1,54 @@
+"""Methods are settings of one loop: each trains, and differs from the default as it says."""
+
+import pytest
+import torch
+
+from goalgan_bt import config, record
+from goalgan_bt.methods import METHODS
+from goalgan_bt.train import train
+
+SHORT = (  # long enough for goals of intermediate difficulty, so that there are traces
+    "--env point_umaze --iterations 4 --threads 1 --coverage.rollouts 1 --gan.pretrain-steps 20 "
+    "--gan.steps 20 --backtracking.min-transitions 100"
+)
+
+
+def trained_with(folder, *flags):
+    folder.mkdir()
+    train(config.from_command_line([*SHORT.split(), *flags]), folder)
+    rows = record.read_metrics(folder)[1]
+    return torch.load(folder / "checkpoint.pt", weights_only=True)["modules"]["policy"], rows
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_each_method_trains_and_reports(method, tmp_path):
+    _, rows = trained_with(tmp_path / method, "--method", method)
+    assert float(rows[-1]["eval/coverage"]) >= 0
+    assert (int(rows[-1]["steps/label"]) > 0) == (method == "oracle")
+    imitated = any(float(row.get("imitation/steps") or 0) > 0 for row in rows)
+    without = "backtracking.trace_length", "imitation.steps"
+    assert imitated == (0 not in [METHODS[method].get(name) for name in without])
+
+
+def test_traces_without_imitation_are_plain_goal_gan(tmp_path):
+    """The model's own randomness must not leak into the policy's."""
+    plain, _ = trained_with(tmp_path / "plain", "--method", "goal_gan")
+    idle, rows = trained_with(tmp_path / "idle", "--method", "no_imitation")
+    default, _ = trained_with(tmp_path / "default")
+    assert float(rows[-1]["backtracking/traces"]) > 0
+    assert torch.equal(plain["net.flat"], idle["net.flat"])
+    assert not torch.equal(plain["net.flat"], default["net.flat"])
+
+
+def test_flags_come_on_top_of_the_method():
+    flags = "--env point_umaze --method uniform --goals.new 50"
+    cfg = config.from_command_line(flags.split())
+    assert (cfg.goals.source, cfg.goals.new, cfg.goals.old) == ("uniform", 50, 0)
+    assert cfg.backtracking.trace_length == 0 and cfg.method == "uniform"
+    with pytest.raises(config.ConfigError, match="unknown method 'magic': choose one of recall"):
+        config.from_command_line(["--method", "magic"])
+
+
+def test_every_setting_of_every_method_exists():
+    for method in METHODS:
+        config.check(config.with_method(config.preset("ant_umaze"), method))

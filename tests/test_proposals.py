@@ -1,0 +1,63 @@
+"""What proposes goals instead of the GAN."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from goalgan_bt import config, envs
+from goalgan_bt.learner import Learner
+from goalgan_bt.proposals import AlpGmm, feasible, oracle
+from goalgan_bt.settings import GoalsConfig
+from goalgan_bt.train import make_env
+
+
+def test_feasible_goals_fill_the_free_space_evenly():
+    env = envs.make("point_umaze", 1)
+    goals = feasible(env, 7000, np.random.default_rng(0))
+    assert goals.shape == (7000, 2) and env.maze.is_free(goals).all()
+    cells = np.unique(np.round(goals / 2), axis=0, return_counts=True)[1]
+    assert len(cells) == 7 and cells.min() > 850 and cells.max() < 1150
+
+
+def test_the_oracle_keeps_goals_of_intermediate_success():
+    env, cfg = envs.make("point_umaze", 64), config.preset("point_umaze")
+    learner = Learner(env, cfg)
+    goals_cfg = GoalsConfig(source="oracle", new=100, r_min=0.1, r_max=0.9)
+    noise = torch.Generator().manual_seed(0)
+    goals, steps = oracle(env, learner.policy, goals_cfg, np.random.default_rng(0), noise)
+    # A fresh policy wanders about the start: only goals near it are reached now and then.
+    assert 0 < len(goals) < 50 and np.median(np.linalg.norm(goals, axis=1)) < 1.5
+    assert 100 * 3 * 20 < steps <= 100 * 3 * 200
+    never = GoalsConfig(source="oracle", new=50, r_min=0.998, r_max=0.999)
+    assert len(oracle(env, learner.policy, never, np.random.default_rng(0), noise)[0]) == 50
+
+
+def test_alp_gmm_seeks_where_outcomes_change():
+    """Success is certain on the left, hopeless on the right, and a coin's toss between."""
+    pytest.importorskip("sklearn")
+    rng = np.random.default_rng(0)
+    teacher = AlpGmm(np.zeros(2), np.ones(2), np.random.default_rng(1))
+    first = teacher.sample(2000)
+    assert first.mean(axis=0) == pytest.approx([0.5, 0.5], abs=0.03)  # nothing known: uniform
+    for _ in range(12):
+        goals = teacher.sample(300)
+        chance = np.where(goals[:, 0] < 0.4, 1.0, np.where(goals[:, 0] < 0.6, 0.5, 0.0))
+        teacher.add(goals, rng.random(300) < chance)
+    x = teacher.sample(2000)[:, 0]
+    between = ((x > 0.37) & (x < 0.63)).mean()
+    assert between > 0.6  # uniform: 0.26; one in five stays uniform
+    assert x.min() >= 0 and x.max() <= 1 and (x < 0.3).any() and (x > 0.7).any()
+
+
+@pytest.mark.parametrize("source", ["gan", "gan_fit_all", "uniform", "feasible", "alp_gmm"])
+def test_every_source_gives_goals_in_the_box(source):
+    if source == "alp_gmm":
+        pytest.importorskip("sklearn")
+    cfg = config.preset("point_umaze")
+    cfg = replace(cfg, goals=replace(cfg.goals, source=source))
+    env = make_env(cfg, 1)
+    goals, steps = Learner(env, cfg).propose(env)
+    assert goals.shape == (cfg.goals.new, 2) and steps == 0
+    assert (goals >= env.goal_low).all() and (goals <= env.goal_high).all()
