@@ -194,7 +194,7 @@ def check(cfg: Config) -> None:
         "trpo.fisher_fraction trpo.line_search_decay backtracking.batch backtracking.buffer "
         "backtracking.learning_rate backtracking.hidden backtracking.min_transitions "
         "backtracking.max_shift imitation.batch imitation.learning_rate imitation.max_kl "
-        "coverage.rollouts coverage.every"
+        "imitation.fade coverage.rollouts coverage.every"
     )
     not_negative = (
         "seed threads goals.old goals.labelled goals.replay_distance goals.label_rollouts "

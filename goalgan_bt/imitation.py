@@ -24,19 +24,28 @@ class Imitation:
         self.policy, self.cfg, self._rng = policy, cfg, generator
         self.optimiser = torch.optim.Adam(policy.net.parameters(), lr=cfg.learning_rate, fused=True)
 
-    def update(self, obs: Tensor, actions: Tensor, reference: Tensor) -> dict[str, float]:
+    def max_kl(self, progress: float) -> float:
+        """The bound on the KL at this progress in the run, 0 to 1."""
+        faded = 0.0 if self.cfg.fade is None else min(1.0, progress / self.cfg.fade)
+        return self.cfg.max_kl * (1 - faded)
+
+    def update(
+        self, obs: Tensor, actions: Tensor, reference: Tensor, progress: float
+    ) -> dict[str, float]:
         """Take up to `cfg.steps` steps, fewer if the KL bound is met.
 
         Args:
             obs: (n, obs_dim) normalised observations of the traces; none is fine.
             actions: (n, act_dim) recalled actions.
             reference: (m, obs_dim) normalised observations of the last rollouts.
+            progress: in the run, 0 to 1.
 
         Returns:
             loss: -log pi(a | s) at the start, nats; kl: on the reference; steps: those taken.
             Nothing for no traces.
         """
-        if len(obs) == 0:
+        max_kl = self.max_kl(progress)
+        if len(obs) == 0 or max_kl <= 0:
             return {}
         params = self.policy.net.flat
         with torch.no_grad():
@@ -56,7 +65,7 @@ class Imitation:
             with torch.no_grad():
                 kls = len(reference) * mean_kl(old_mean, old_log_std, *self.policy(reference))
                 new_kl = ranks.total(kls).item() / everybodys
-                if not new_kl <= self.cfg.max_kl:
+                if not new_kl <= max_kl:
                     params.copy_(before)
                     break
             kl, taken = new_kl, taken + 1

@@ -182,6 +182,9 @@ class ImitationConfig:
     """Step size of Adam, an optimiser of its own."""
     max_kl: float = 0.005
     """Imitation stops where the mean KL on the last rollouts passes this, nats."""
+    fade: float | None = None
+    """If given, that bound falls on a line to zero at this share of the run: what helps a novice
+    holds back an expert."""
 
 
 @dataclass(frozen=True)

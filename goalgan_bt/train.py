@@ -124,7 +124,8 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
         last = False
         while not last:
             learner.iteration += 1
-            policy.cap_std(agreed(finished(cfg, learner, clock.total())))
+            progress = agreed(finished(cfg, learner, clock.total()))
+            policy.cap_std(progress)
 
             # Goals: most imagined by the generator, some remembered so that old skills stay.
             imagined, steps = learner.propose(test_env)
@@ -193,8 +194,9 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
                 trace_obs, trace_actions = to_imitate(learner, env, traces, cfg).lesson(env)
                 every = max(1, ranks.size() * len(obs) // KL_SAMPLE)
                 rows = torch.arange(0, ranks.size() * len(obs), every)
+                reference = obs[ranks.mine(rows, len(obs))]
                 imitated = learner.imitation.update(
-                    policy.normaliser(trace_obs), trace_actions, obs[ranks.mine(rows, len(obs))]
+                    policy.normaliser(trace_obs), trace_actions, reference, progress
                 )
                 # Only now: the policy must not change under data that it made. The last batch
                 # stands for all of the iteration's.

@@ -18,7 +18,7 @@ def test_recalled_actions_become_likelier_and_the_std_stays():
     actions = torch.stack([obs[:, 0], -obs[:, 1]], dim=1).clamp(-1, 1)
     before = log_prob(*policy(obs), actions).mean().item()
     std = policy.log_std.clone()
-    stats = imitation.update(obs, actions, obs)
+    stats = imitation.update(obs, actions, obs, 0.0)
     assert stats["steps"] == 200
     assert -stats["loss"] == pytest.approx(before, abs=0.2)
     assert log_prob(*policy(obs), actions).mean().item() > before + 0.3
@@ -29,7 +29,7 @@ def test_the_kl_bound_holds_and_says_so():
     policy, imitation = make(steps=200, learning_rate=1e-3, max_kl=0.01)
     obs, reference = torch.randn(300, 4), torch.randn(500, 4)
     mean, log_std = (x.detach().clone() for x in policy(reference))
-    stats = imitation.update(obs, torch.ones(300, 2), reference)
+    stats = imitation.update(obs, torch.ones(300, 2), reference, 0.5)
     kl = mean_kl(mean, log_std, *policy(reference)).item()
     assert 0 < stats["steps"] < 200
     assert 0 < kl <= 0.01 and stats["kl"] == pytest.approx(kl)
@@ -38,15 +38,27 @@ def test_the_kl_bound_holds_and_says_so():
 def test_no_traces_change_nothing():
     policy, imitation = make()
     before = [p.clone() for p in policy.parameters()]
-    assert imitation.update(torch.empty(0, 4), torch.empty(0, 2), torch.randn(5, 4)) == {}
+    nothing = torch.empty(0, 4), torch.empty(0, 2), torch.randn(5, 4)
+    assert imitation.update(*nothing, 0.0) == {}
     assert all(torch.equal(a, b) for a, b in zip(before, policy.parameters(), strict=True))
+
+
+def test_the_bound_fades_on_a_line():
+    policy, imitation = make(max_kl=0.02, fade=0.4)
+    bounds = [imitation.max_kl(progress) for progress in (0.0, 0.1, 0.2, 0.4, 1.5)]
+    assert bounds == pytest.approx([0.02, 0.015, 0.01, 0.0, 0.0])
+    obs, before = torch.randn(300, 4), policy.net.flat.clone()
+    assert imitation.update(obs, torch.ones(300, 2), obs, 0.4) == {}
+    assert torch.equal(before, policy.net.flat)
+    assert imitation.update(obs, torch.ones(300, 2), obs, 0.3)["kl"] <= 0.005
+    assert make(max_kl=0.02)[1].max_kl(0.9) == 0.02
 
 
 def test_the_gradient_is_that_of_the_likelihood():
     policy, imitation = make(steps=1, learning_rate=1e-3, batch=16)
     imitation.optimiser.param_groups[0]["lr"] = 0.0
     obs, actions = torch.randn(1, 4), torch.rand(1, 2)
-    imitation.update(obs, actions, obs)
+    imitation.update(obs, actions, obs, 0.0)
     mean = by_torch(policy.net, policy.net.flat, obs)
     loss = -log_prob(mean, policy.bounded_log_std().detach(), actions).mean()
     (expected,) = torch.autograd.grad(loss, policy.net.flat)
