@@ -38,7 +38,7 @@ class Learner:
         self.cfg = cfg.goals
         self._reach = max(env.success_radius, cfg.goals.near)  # metres
         self._wants_model = (
-            cfg.backtracking.trace_length > 0 and cfg.imitation.source != "successes"
+            cfg.backtracking.trace_length > 0 and cfg.imitation.source != "experience"
         )
         self.iteration = 0
         self.steps = {"train": 0, "label": 0, "eval": 0}

@@ -17,10 +17,10 @@ METHODS: dict[str, dict[str, Any]] = {
     "recall_traces_paper": {
         "backtracking.steps": 20,
         "backtracking.batch": 256,
-        "backtracking.sample_actions": True,
-        "backtracking.conditioned": False,
-        "backtracking.seeds": "goals",
-        "imitation.source": "traces",
+        "backtracking.experience": "successes",
+        "imitation.steps": 20,
+        "imitation.max_kl": 0.02,
+        "imitation.fade": None,
         "imitation.relabel": False,
     },
     # Curricula without traces.
@@ -30,11 +30,20 @@ METHODS: dict[str, dict[str, Any]] = {
     "feasible": NO_REPLAY | {"goals.source": "feasible"},
     "oracle": NO_REPLAY | {"goals.source": "oracle"},
     "alp_gmm": NO_REPLAY | {"goals.source": "alp_gmm"},
-    # Controls: what of the default does it?
+    # Controls: what of the default does it? Real steps of successes for their own goal, or of all
+    # episodes for later places, take the place of traces, with as many updates.
     "no_imitation": {"imitation.steps": 0},
     "random_model": {"backtracking.steps": 0},
-    "self_imitation": {"imitation.source": "successes", "imitation.relabel": False},
-    "hindsight": {"imitation.source": "successes", "imitation.relabel": True},
+    "self_imitation": {
+        "backtracking.experience": "successes",
+        "imitation.source": "experience",
+        "imitation.relabel": False,
+    },
+    "hindsight": {
+        "backtracking.experience": "all",
+        "imitation.source": "experience",
+        "imitation.relabel": True,
+    },
     "value_seeds": {"backtracking.seeds": "values"},
     "forward_model": {"imitation.source": "forward"},
 }

@@ -167,10 +167,10 @@ class BacktrackingConfig:
 class ImitationConfig:
     """Imitation of recall traces."""
 
-    source: Literal["traces", "successes", "forward"] = "traces"
-    """What is imitated: recall traces; as many steps before the end of episodes that really
-    succeeded (self-imitation); steps that a forward model imagines of the policy, where they reach
-    the goal (after Dyna). The latter two are controls."""
+    source: Literal["traces", "experience", "forward"] = "traces"
+    """What is imitated: recall traces; as many real steps, as long before the end of their episode
+    (self-imitation); steps that a forward model imagines of the policy, where they reach the goal
+    (after Dyna). The latter two are controls."""
     relabel: bool = False
     """Imitate each step for a random later place of its trace or episode (hindsight) instead of
     for the goal at its end."""

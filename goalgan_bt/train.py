@@ -323,7 +323,7 @@ def to_imitate(learner: Learner, env: GoalEnv, traces: RecallTraces, cfg: Config
         states, goals = data.sample(most, rng)
         noise = learner.noise["imitation"]
         return imagine(learner.forward, learner.policy, env, states, goals, length, noise)
-    if cfg.imitation.source == "successes":
+    if cfg.imitation.source == "experience":
         return data.last_steps(env, most * length, length, relabel, rng)
     return traces.steps(env, relabel, rng)
 

@@ -49,8 +49,30 @@ PLOTS = (
         (
             ("gan/discriminator_loss", "discriminator"),
             ("gan/generator_loss", "generator"),
-            ("backtracking/action_nll", "q(a | s')"),
-            ("backtracking/state_nll", "q(ds | a, s')"),
+        ),
+    ),
+    Plot(
+        "Backtracking model, -log likelihood of new transitions, nats",
+        (
+            ("backtracking/held_out_action_nll", "q(a | s')"),
+            ("backtracking/held_out_state_nll", "q(ds | a, s')"),
+        ),
+    ),
+    Plot(
+        "Recall traces",
+        (
+            ("backtracking/decoded", "goals decoded"),
+            ("backtracking/valid", "steps valid"),
+            ("backtracking/arrived", "arrive in the simulator"),
+        ),
+        share=True,
+    ),
+    Plot(
+        "Recall traces, metres per action",
+        (
+            ("backtracking/moved", "length of a step"),
+            ("backtracking/gap", "error of a step"),
+            ("backtracking/gap_last", "error of the last step"),
         ),
     ),
     Plot("Imitation loss, nats", (("imitation/loss", "-log pi(a | s, g)"),)),
