@@ -127,9 +127,9 @@ ANT = Config(
     updates=4,
     policy=PolicyConfig(init_std=0.2, final_std=0.07),
     rollout=RolloutConfig(num_envs=256, steps=50),
-    gan=GanConfig(steps=100),
+    gan=GanConfig(steps=100, generator_hidden=(128, 128)),
     backtracking=BacktrackingConfig(trace_length=50),
-    imitation=ImitationConfig(steps=5, learning_rate=1e-5, max_kl=0.0005),
+    imitation=ImitationConfig(steps=10, learning_rate=5e-5, max_kl=0.003, fade=0.3),
 )
 POINT = Config(
     env="point_umaze",
@@ -143,7 +143,7 @@ POINT = Config(
     goals=GoalsConfig(old=40, r_min=0.05),
     trpo=TrpoConfig(max_kl=0.015),
     backtracking=BacktrackingConfig(trace_length=20),
-    imitation=ImitationConfig(max_kl=0.02),
+    imitation=ImitationConfig(steps=40, max_kl=0.05, fade=0.15),
     coverage=CoverageConfig(rollouts=2, every=250_000),
 )
 

@@ -145,9 +145,9 @@ class BacktrackingConfig:
     """Transitions per training step."""
     learning_rate: float = 1e-3
     """Step size of Adam."""
-    experience: Literal["successes", "all"] = "successes"
-    """Episodes whose transitions are kept: those that reached their goal, or also those that ran
-    out of time, for the place where they ended (hindsight)."""
+    experience: Literal["successes", "all"] = "all"
+    """Episodes whose transitions are kept: those that reached their goal (the paper), or also those
+    that ran out of time, for the place where they ended (hindsight)."""
     buffer: int = 100_000
     """Transitions that are kept, the newest."""
     min_transitions: int = 5_000
@@ -171,9 +171,9 @@ class ImitationConfig:
     """What is imitated: recall traces; as many real steps, as long before the end of their episode
     (self-imitation); steps that a forward model imagines of the policy, where they reach the goal
     (after Dyna). The latter two are controls."""
-    relabel: bool = False
+    relabel: bool = True
     """Imitate each step for a random later place of its trace or episode (hindsight) instead of
-    for the goal at its end."""
+    for the goal at its end (the paper)."""
     steps: int = 20
     """Gradient steps per iteration."""
     batch: int = 512
