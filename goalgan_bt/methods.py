@@ -31,7 +31,8 @@ METHODS: dict[str, dict[str, Any]] = {
     "oracle": NO_REPLAY | {"goals.source": "oracle"},
     "alp_gmm": NO_REPLAY | {"goals.source": "alp_gmm"},
     # Controls: what of the default does it? Real steps of successes for their own goal, or of all
-    # episodes for later places, take the place of traces, with as many updates.
+    # episodes for later places, take the place of traces, with as many updates. Without imitation
+    # all is as in goal_gan but for the random numbers: so far apart are two methods that are one.
     "no_imitation": {"imitation.steps": 0},
     "random_model": {"backtracking.steps": 0},
     "self_imitation": {

@@ -30,6 +30,8 @@ class PlotConfig:
     """PNG to write; by default coverage.png in the first run folder."""
     maps: int = 4
     """Coverage maps per run, spread over training."""
+    at: tuple[int, ...] = ()
+    """Iterations whose maps to draw instead."""
 
 
 def main() -> int:
@@ -38,6 +40,8 @@ def main() -> int:
         cfg = parse(PlotConfig, None, "python -m goalgan_bt.plot")
         if not cfg.runs or not 1 <= cfg.maps <= 50:
             raise UsageError("name at least one run folder, and ask for 1 to 50 maps")
+        if len(cfg.at) > 50 or min(cfg.at, default=1) < 1:
+            raise UsageError("--at takes 1 to 50 iterations, each 1 or more")
         if cfg.out is not None and cfg.out.suffix != ".png":
             raise UsageError(f"cannot write '{cfg.out}': its name must end in .png")
         try:
@@ -45,7 +49,7 @@ def main() -> int:
         except ImportError:
             raise RunError('plots need matplotlib: pip install "goalgan_bt[plots]"') from None
         path = cfg.out or cfg.runs[0] / "coverage.png"
-        pictures.overview(list(cfg.runs), cfg.maps).savefig(path, dpi=150)
+        pictures.overview(list(cfg.runs), cfg.maps, cfg.at).savefig(path, dpi=150)
     except (RunError, OSError, ValueError) as error:
         complain(str(error))
         return 2

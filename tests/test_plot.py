@@ -27,6 +27,19 @@ def test_the_maps_tiles_fill_the_free_cells(folder):
     assert ax.patches[0].get_width() == pytest.approx(0.5)
 
 
+def test_maps_of_chosen_iterations(folder, tmp_path):
+    assert [f.stem for f in pictures.frames_at(folder, (3, 2, 90))] == [
+        "000003",
+        "000002",
+        "000004",
+    ]
+    titles = [ax.get_title() for ax in pictures.overview([folder], at=(2, 4)).axes]
+    assert titles[0].startswith("iteration 2: ") and titles[1].startswith("iteration 4: ")
+    done = plot(folder, "--at", 1, 2, "--out", tmp_path / "c.png")
+    assert done.returncode == 0, done.stderr
+    assert plot(folder, "--at", 0).returncode == 2
+
+
 def test_runs_of_any_name_can_be_drawn(folder, tmp_path):
     """Also those for which nothing was ever published, and several together."""
     other = tmp_path / "ant_spiral-test"

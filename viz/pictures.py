@@ -97,22 +97,30 @@ def measured_frames(folder: Path) -> list[Path]:
     return [frame for frame in record.frames(folder) if success(record.read_frame(frame))[1]]
 
 
-def overview(folders: list[Path], maps: int = 4) -> Figure:
+def frames_at(folder: Path, iterations: tuple[int, ...]) -> list[Path]:
+    """The frames nearest to those iterations, measured or not."""
+    frames = record.frames(folder)
+    return [min(frames, key=lambda frame: abs(int(frame.stem) - i)) for i in iterations if frames]
+
+
+def overview(folders: list[Path], maps: int = 4, at: tuple[int, ...] = ()) -> Figure:
     """A row of coverage maps over training per run, and all curves below.
 
     Args:
         folders: the runs.
-        maps: how many reports of each run to show, evenly spread.
+        maps: how many measured reports of each run to show, evenly spread.
+        at: or the iterations whose reports to show.
 
     Raises:
-        RunError: if a folder is no run or holds no measured report yet.
+        RunError: if a folder is no run or holds no such report yet.
     """
+    maps = len(at) or maps
     with_maze = [folder for folder in folders if maze_of(folder) is not None]
     rows = len(with_maze)
     figure = Figure(figsize=(2.4 * maps, 2.6 * rows + 3.2), layout="constrained")
     grid = figure.add_gridspec(rows + 1, maps, height_ratios=[2.6] * rows + [3.2])
     for r, folder in enumerate(with_maze):
-        frames = measured_frames(folder)
+        frames = frames_at(folder, at) or measured_frames(folder)
         if not frames:
             raise record.RunError(f"{folder} holds no report yet: wait for its first evaluation")
         picks = np.unique(np.linspace(0, len(frames) - 1, maps).round().astype(int))
