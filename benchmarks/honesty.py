@@ -12,18 +12,22 @@ import json
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-import tyro
 
 from goalgan_bt import checkpoint, config
+from goalgan_bt.command_line import UsageError, parse
 from goalgan_bt.coverage import coverage
 from goalgan_bt.learner import Learner
 from goalgan_bt.policy import Actor
+from goalgan_bt.progress import complain
+from goalgan_bt.record import RunError
 from goalgan_bt.train import TEST_ENVS, make_env
 
-CELLS = [(3, 1), (3, 2), (3, 3), (2, 3), (1, 3), (1, 2), (1, 1)]  # free ones, the start first
+START = (3, 1)  # in their map
+CELLS = [(3, 2), (3, 3), (2, 3), (1, 3), (1, 2), (1, 1)]  # the other free ones
 
 
 @dataclass(frozen=True)
@@ -74,10 +78,10 @@ def in_gymnasium(folder: Path, episodes: int) -> dict[str, float]:
     act, successes = Actor(learner.policy), np.zeros((len(CELLS), episodes))
     for i, cell in enumerate(CELLS):
         for episode in range(episodes):
-            options = {"reset_cell": np.array(CELLS[0]), "goal_cell": np.array(cell)}
+            options = {"reset_cell": np.array(START), "goal_cell": np.array(cell)}
             obs, info = theirs.reset(seed=cfg.seed * episodes + episode, options=options)
-            ended = bool(info["success"])
-            successes[i, episode] = ended
+            assert not info["success"]
+            ended = False
             while not ended:
                 state = 2 * obs["observation"][None]  # our cells are twice as wide,
                 state[:, :2] += 2  # and our origin is the start cell's centre
@@ -92,17 +96,29 @@ def in_gymnasium(folder: Path, episodes: int) -> dict[str, float]:
 
 def main() -> int:
     """Measure and print."""
-    settings = tyro.cli(Settings)
-    rows = []
+    try:
+        settings = parse(Settings, None, "python benchmarks/honesty.py")
+        if not settings.ant and not settings.point:
+            raise UsageError("name run folders with --ant or --point")
+        rows = measured(settings)
+    except (UsageError, RunError) as error:
+        complain(str(error))
+        return 2
+    if settings.json is not None:
+        settings.json.write_text(json.dumps(rows, indent=1) + "\n")
+    return 0
+
+
+def measured(settings: Settings) -> list[dict[str, Any]]:
+    """A row for each run, printed as it is known."""
+    rows: list[dict[str, Any]] = []
     for folder in settings.ant:
         rows.append({"run": folder.name, **integrators(folder, settings.rollouts)})
         print(rows[-1], flush=True)
     for folder in settings.point:
         rows.append({"run": folder.name, **in_gymnasium(folder, settings.episodes)})
         print(rows[-1], flush=True)
-    if settings.json is not None:
-        settings.json.write_text(json.dumps(rows, indent=1) + "\n")
-    return 0
+    return rows
 
 
 if __name__ == "__main__":

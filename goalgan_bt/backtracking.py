@@ -45,7 +45,7 @@ class Steps(NamedTuple):
 
 
 class Transitions:
-    """A ring of transitions (s, a, s') of successful episodes, each episode's in order.
+    """A ring of transitions (s, a, s') of episodes (see `cfg.experience`), each one's in order.
 
     Attributes:
         states, next_states: (capacity, state_dim); actions: (capacity, act_dim); goals:
@@ -128,8 +128,8 @@ class RecallTraces(NamedTuple):
         if relabel:
             achieved = env.achieved_goals(self.states.reshape(-1, env.state_dim))
             places = np.concatenate([self.goals[None], achieved.reshape(goals.shape)])
-            steps = np.arange(len(self.valid))[:, None]  # what follows step t: places[: t + 1]
-            later = rng.integers(steps + 1, size=self.valid.shape)
+            ages = np.arange(len(self.valid))[:, None]  # what follows step t: places[: t + 1]
+            later = rng.integers(ages + 1, size=self.valid.shape)
             goals = places[later, np.arange(len(self.goals))]
         return Steps(self.states[self.valid], self.actions[self.valid], goals[self.valid])
 
@@ -304,8 +304,9 @@ class Consistency(NamedTuple):
     """What the simulator says to recall traces.
 
     gap: (L, n) how far from the trace's next place the simulator arrives, metres, NaN after the
-    trace stopped; moved: (L, n) how far that place is from the one before; arrived: (n,) whether
-    the actions of the trace, from its far end on, reach the goal; steps: environment steps spent.
+    trace stopped; moved: (L, n) how far that place is from the one before; arrived: (m,) whether
+    the actions of the trace, from its far end on, reach the goal, for those m traces that do not
+    begin on it; steps: environment steps spent.
     """
 
     gap: FloatArray
@@ -317,12 +318,13 @@ class Consistency(NamedTuple):
         """Means over all steps, and over the last ones of the traces; the share that arrived."""
         if not np.isfinite(self.gap).any():
             return {}
-        known = np.isfinite(self.gap).any(axis=1)
+        length = np.isfinite(self.gap).sum(axis=0)
+        last = self.gap[length - 1, np.arange(len(length))][length > 0]
         return {
-            "gap": np.nanmean(self.gap),
-            "gap_last": np.nanmean(self.gap[known][-1]),
-            "moved": np.nanmean(self.moved),
-            "arrived": self.arrived.mean(),
+            "gap": float(np.nanmean(self.gap)),
+            "gap_last": float(last.mean()),
+            "moved": float(np.nanmean(self.moved)),
+            "arrived": float(self.arrived.mean()) if len(self.arrived) else math.nan,
         }
 
 
@@ -348,16 +350,18 @@ def consistency(env: GoalEnv, traces: RecallTraces) -> Consistency:
         following = traces.states[t, :n]
         steps += len(some) * env.action_repeat
     # Now in one go, from the far end to the goal.
-    arrived = np.zeros(n, dtype=bool)
+    arrived, away = np.zeros((2, n), dtype=bool)
     for t in reversed(range(length)):
         begins = ids[valid[t] & (~valid[t + 1] if t + 1 < length else True)]
+        far = env.achieved_goals(traces.states[t, begins])
+        away[begins] = _distance(far, goals[begins]) >= env.success_radius
         env.reset(begins, goals[begins], traces.states[t, begins])
         some = ids[valid[t] & ~arrived]
         env.advance(some, traces.actions[t, some])
         here = env.achieved_goals(env.read_states(some))
         arrived[some] = _distance(here, goals[some]) < env.success_radius
         steps += len(some) * env.action_repeat
-    return Consistency(gap, moved, arrived, steps)
+    return Consistency(gap, moved, arrived[away], steps)
 
 
 def _distance(a: FloatArray, b: FloatArray) -> FloatArray:

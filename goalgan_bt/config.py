@@ -253,6 +253,10 @@ def check(cfg: Config) -> None:
         raise ConfigError(f"--dim must be 2 to 6, not {cfg.dim}")
     if cfg.dim != 2 and cfg.env != "point_nd":
         raise ConfigError(f"--dim goes with point_nd: {cfg.env} has two dimensions")
+    if cfg.goals.source == "gan_fit_all" and cfg.goals.near == math.inf:
+        raise ConfigError(
+            "gan_fit_all needs to know the places visited: give a finite --goals.near"
+        )
     if cfg.goals.r_min >= cfg.goals.r_max:
         raise ConfigError("--goals.r-min must be less than --goals.r-max")
 

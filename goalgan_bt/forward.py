@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from goalgan_bt.backtracking import Scale, Steps, Transitions, learn_gaussian, sample_gaussian
 from goalgan_bt.envs.batch import GoalEnv
-from goalgan_bt.envs.maze import FloatArray
+from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.mlp import MLP, RELU
 from goalgan_bt.policy import Actor, GaussianPolicy
 from goalgan_bt.settings import BacktrackingConfig
@@ -42,15 +42,15 @@ class ForwardModel(nn.Module):
         in normalised units, or nothing while the buffer is too small."""
         if not data.enough:
             return {}
-        losses = []
-        for _ in range(self.cfg.steps):
-            rows = torch.randint(data.size, (self.cfg.batch,), generator=self._rng).numpy()
-            states = torch.from_numpy(data.states[rows])
-            deltas = torch.from_numpy(data.next_states[rows]) - states
-            self.state_scale.set(states)
-            self.delta_scale.set(deltas)
-            inputs = self._inputs(states, torch.from_numpy(data.actions[rows]))
-            losses.append(learn_gaussian(self.net, inputs, self.delta_scale.normalise(deltas)))
+        size, losses = self.cfg.batch, []
+        rows = torch.randint(data.size, (self.cfg.steps * size,), generator=self._rng).numpy()
+        states, actions = torch.from_numpy(data.states[rows]), torch.from_numpy(data.actions[rows])
+        deltas = torch.from_numpy(data.next_states[rows]) - states
+        self.state_scale.set(states)
+        self.delta_scale.set(deltas)
+        inputs, targets = self._inputs(states, actions), self.delta_scale.normalise(deltas)
+        for x, target in zip(inputs.split(size), targets.split(size), strict=True):
+            losses.append(learn_gaussian(self.net, x, target))
             nn.utils.clip_grad_norm_(self.parameters(), 1.0)
             self.optimiser.step()
         return {"forward_nll": float(np.mean(losses))} if losses else {}
@@ -74,7 +74,8 @@ def imagine(
     length: int,
     noise: torch.Generator,
 ) -> Steps:
-    """Let the policy act in the model, and keep the steps of imagined episodes that succeed.
+    """Let the policy act in the model, and keep the steps of imagined episodes that succeed, for
+    the goals that they wanted.
 
     Args:
         model: the forward model.
@@ -88,7 +89,8 @@ def imagine(
     n = len(states)
     if n == 0:
         return Steps(states, np.empty((0, env.act_dim)), goals)
-    act, alive, successful = Actor(policy), np.ones(n, dtype=bool), np.zeros(n, dtype=bool)
+    act, successful = Actor(policy), np.zeros(n, dtype=bool)
+    alive = ~_reached(env, states, goals)
     visited = np.zeros((length, n, env.state_dim))
     actions = np.zeros((length, n, env.act_dim))
     taken = np.zeros((length, n), dtype=bool)
@@ -101,10 +103,14 @@ def imagine(
         following = env.repair(model.successors(s, a).double().numpy())
         alive = alive & env.valid(following)
         states = np.where(alive[:, None], following, states)
-        gap = np.linalg.norm(env.achieved_goals(states) - goals, axis=1)
-        reached = alive & (gap < env.success_radius)
+        reached = alive & _reached(env, states, goals)
         successful |= reached
         alive &= ~reached
     kept = taken & successful
     spread = np.broadcast_to(goals, (length, n, env.goal_dim))
     return Steps(visited[kept], actions[kept], spread[kept])
+
+
+def _reached(env: GoalEnv, states: FloatArray, goals: FloatArray) -> BoolArray:
+    gap = np.linalg.norm(env.achieved_goals(states) - goals, axis=1)
+    return np.asarray(gap < env.success_radius)

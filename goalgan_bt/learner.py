@@ -31,15 +31,14 @@ class Learner:
         rng: numpy's generator; noise: torch's, one per part, since parts learn side by side.
         policy, value, gan, estimator, replay, visited, backtracking, transitions, imitation: the
             parts; alp_gmm, forward: those that only some controls have, else None.
+        recalls: whether there are recall traces.
     """
 
     def __init__(self, env: GoalEnv, cfg: Config) -> None:
         torch.manual_seed(cfg.seed)  # first weights
         self.cfg = cfg.goals
         self._reach = max(env.success_radius, cfg.goals.near)  # metres
-        self._wants_model = (
-            cfg.backtracking.trace_length > 0 and cfg.imitation.source != "experience"
-        )
+        self.recalls = cfg.backtracking.trace_length > 0 and cfg.imitation.source == "traces"
         self.iteration = 0
         self.steps = {"train": 0, "label": 0, "eval": 0}
         self.seconds = 0.0
@@ -88,12 +87,13 @@ class Learner:
         return self.gan.sample(n), 0
 
     def fit_model(self) -> dict[str, float]:
-        """Let the model whose steps are imitated learn what preceded success."""
-        model = self.backtracking if self.forward is None else self.forward
-        return model.fit(self.transitions) if self._wants_model else {}
+        """Let the model whose steps are imitated learn from the transitions."""
+        if self.forward is not None:
+            return self.forward.fit(self.transitions)
+        return self.backtracking.fit(self.transitions) if self.recalls else {}
 
     def remember(self, episodes: Episodes) -> None:
-        """Take in finished episodes: outcomes for the estimator, successes to backtrack from."""
+        """Take in finished episodes: outcomes for the estimator, transitions for the model."""
         first, won = episodes.from_start, episodes.success
         self.estimator.add(episodes.goals[first], won[first])
         if self.alp_gmm is not None:
@@ -155,7 +155,11 @@ class Learner:
             "backtracking": self.backtracking,
             "backtracking_optimiser": self.backtracking.optimiser,
             "imitation_optimiser": self.imitation.optimiser,
-        } | ({} if self.forward is None else {"forward": self.forward})
+        } | (
+            {}
+            if self.forward is None
+            else {"forward": self.forward, "forward_optimiser": self.forward.optimiser}
+        )
 
     def tensors(self) -> list[Tensor]:
         """Every network's parameters and buffers, as they are held."""
@@ -177,6 +181,7 @@ class Learner:
             "visited": torch.from_numpy(self.visited.goals),
             "estimator_goals": torch.from_numpy(self.estimator.goals),
             "estimator_success": torch.from_numpy(self.estimator.success),
+            "alp_gmm": {} if self.alp_gmm is None else self.alp_gmm.state_dict(),
             "transitions": {
                 name: torch.from_numpy(getattr(rows, name)[rows.newest(rows.size)])
                 for name in rows.COLUMNS
@@ -207,6 +212,8 @@ class Learner:
         self.visited.goals = state["visited"].numpy().copy()
         self.estimator.goals = state["estimator_goals"].numpy().copy()
         self.estimator.success = state["estimator_success"].numpy().copy()
+        if self.alp_gmm is not None:
+            self.alp_gmm.load_state_dict(state["alp_gmm"])
         rows = self.transitions
         rows.size = rows.cursor = rows.added = 0
         rows.add(*(state["transitions"][name].numpy() for name in rows.COLUMNS))

@@ -51,6 +51,9 @@ def oracle(
     return goals[good] if good.any() else goals, steps
 
 
+STATE = ("goals", "success", "recent_goals", "recent_success")
+
+
 class AlpGmm:
     """Absolute learning progress with Gaussian mixtures (Portelas et al. 2019).
 
@@ -107,6 +110,23 @@ class AlpGmm:
             for k in self.COMPONENTS
         ]
         self._fitted = min(mixtures, key=lambda mixture: mixture.aic(points))
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """All that was tried; the mixture is fitted anew from it."""
+        columns = self._goals, self._success, self._recent, self._outcomes
+        return dict(zip(STATE, map(torch.from_numpy, columns), strict=True))
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        """Take over what `state_dict` gave."""
+        self._goals, self._success, self._recent, self._outcomes = (
+            state[name].numpy().copy() for name in STATE
+        )
+        older, newer = self._goals[: -self.WINDOW], self._goals[-self.WINDOW :]
+        if len(older):
+            known = self._success[: len(older)]
+            nearest = self._tree(older).query(newer, return_distance=False)[:, 0]
+            progress = np.abs(self._success[len(older) :] - known[nearest])
+            self._fit(np.column_stack([newer, progress]))
 
     def sample(self, n: int) -> FloatArray:
         """Goals in the box, (n, goal_dim)."""

@@ -15,13 +15,15 @@ if __name__ == "__main__":  # nothing is lost: what is finished is on disk, the 
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
 
 import csv
+import fcntl
+import re
 import shlex
 import subprocess
 import time
 import tomllib
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -32,18 +34,19 @@ from goalgan_bt.command_line import UsageError, parse
 from goalgan_bt.progress import complain, say
 
 SHIPPED = Path(__file__).parent / "studies"
+KEY = ("env", "method", "seed")
 CURVES = ("env", "method", "seed", "steps", "coverage")  # columns of runs.csv, a row per report
+OURS = {"--env", "--seed", "--out", "--resume", "--viz", "--threads", "--help", "-h"}
 COSTS = ("env", "method", "seed", "flags", "commit", "train", "label", "eval", "seconds")
 
 
 class Study(NamedTuple):
-    """name: of the file; envs, methods (name -> flags), seeds (from 0 on): the grid; flags: of
-    all."""
+    """name: of the file; envs, methods (name -> flags), seeds: the grid; flags: of all."""
 
     name: str
     envs: list[str]
     methods: dict[str, str]
-    seeds: int
+    seeds: range
     flags: str
 
 
@@ -74,8 +77,7 @@ class StudyConfig:
     processes: int = 0
     """Runs at a time; 0 is one per core."""
     engine: Literal["here", "submitit"] = "here"
-    """Where runs run: on this machine, or as jobs of a SLURM cluster (submitit, extra `study`;
-    where there is no SLURM it uses this machine)."""
+    """Where runs run: on this machine, or as jobs of a SLURM cluster (submitit, extra `study`)."""
     partition: str | None = None
     """SLURM partition for submitit."""
     report: bool = False
@@ -103,17 +105,26 @@ def load(name: str) -> Study:
     for key, kind in kinds.items():
         if not isinstance(table.get(key), kind) or not table[key]:
             raise UsageError(f"{wrong}it needs {key} (envs = [...], seeds = 5, [methods])")
-    if unknown := set(table) - {*kinds, "flags"}:
+    if unknown := set(table) - {*kinds, "flags", "first_seed"}:
         raise UsageError(f"{wrong}it has an unknown key {unknown.pop()!r}")
-    flags = table.get("flags", "")
+    flags, first = table.get("flags", ""), table.get("first_seed", 0)
     texts = [*table["envs"], *table["methods"].values(), flags]
-    if not all(isinstance(text, str) for text in texts) or table["seeds"] < 1:
-        raise UsageError(f"{wrong}environments and flags are texts, seeds a number from 1 on")
-    study = Study(path.stem, table["envs"], table["methods"], table["seeds"], flags)
-    for run in grid(study):
+    if not all(isinstance(text, str) for text in texts) or len({*table["envs"]}) < len(
+        table["envs"]
+    ):
+        raise UsageError(f"{wrong}environments (each once) and flags are texts")
+    if type(table["seeds"]) is not int or table["seeds"] < 1 or type(first) is not int or first < 0:
+        raise UsageError(f"{wrong}seeds is a number from 1 on, first_seed from 0 on")
+    if bad := [name for name in table["methods"] if not re.fullmatch(r"\w[\w.+-]*", name)]:
+        raise UsageError(f"{wrong}a method's name is letters, digits, _ . + -, not {bad[0]!r}")
+    seeds = range(first, first + table["seeds"])
+    study = Study(path.stem, table["envs"], table["methods"], seeds, flags)
+    for run in grid(study._replace(seeds=seeds[:1])):
         try:
+            if given := {word.split("=")[0] for word in shlex.split(run.flags)} & OURS:
+                raise UsageError(f"{given.pop()} is the study's own")
             config.from_command_line(words(run))
-        except UsageError as error:
+        except ValueError as error:  # UsageError is one
             raise UsageError(f"{wrong}{run.env}, {run.method}: {error}") from None
     return study
 
@@ -122,7 +133,7 @@ def grid(study: Study) -> list[Run]:
     """Every run of a study, seed by seed, so that all methods have as many at any time."""
     return [
         Run(env, method, seed, f"{study.flags} {flags}".strip())
-        for seed in range(study.seeds)
+        for seed in study.seeds
         for env in study.envs
         for method, flags in study.methods.items()
     ]
@@ -135,7 +146,7 @@ def words(run: Run) -> list[str]:
 
 
 def perform(run: Run, folder: Path) -> Path:
-    """Train in a process of its own, or go on with what was cut off.
+    """Train in a process of its own with one simulation thread, or go on with what was cut off.
 
     Args:
         run: what to train.
@@ -145,14 +156,18 @@ def perform(run: Run, folder: Path) -> Path:
         The run folder.
 
     Raises:
-        RunError: if training failed, with its last words.
+        RunError: if training failed, with its last words, or was begun with other settings.
     """
     flags = [*words(run), "--out", str(folder)]
     if begun := sorted(folder.glob("*/checkpoint.pt")):
-        ended = begun[-1].with_name(record.ENDED)
+        place = begun[-1].parent
+        asked = config.from_command_line(words(run))
+        if replace(config.load(place), out=asked.out, resume=None) != asked:
+            raise record.RunError(f"{place} was begun with other settings: remove it")
+        ended = place / record.ENDED
         if ended.exists() and ended.read_text().startswith("complete"):
-            return ended.parent
-        flags = ["--resume", str(ended.parent), "--viz", "none"]
+            return place
+        flags = ["--resume", str(place), "--viz", "none"]
     folder.mkdir(parents=True, exist_ok=True)
     done = subprocess.run(
         [sys.executable, "-m", "goalgan_bt.train", *flags],
@@ -161,7 +176,8 @@ def perform(run: Run, folder: Path) -> Path:
         stderr=subprocess.PIPE,
         text=True,
     )
-    if done.returncode != 0:
+    finished = begun and "has reached its limits" in done.stderr  # killed just before it said so
+    if done.returncode != 0 and not finished:
         last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
         raise record.RunError(f"{run.env}, {run.method}, seed {run.seed} failed: {last}")
     return sorted(folder.glob("*/checkpoint.pt"))[-1].parent
@@ -180,8 +196,16 @@ class Tables:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
-        self.curves = _read(folder / "runs.csv", CURVES)
+        self._lock = (folder / ".lock").open("w")
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise record.RunError(f"{folder} is another study's at work: wait for it") from None
         self.costs = _read(folder / "costs.csv", COSTS)
+        # Costs are written last: what has none was cut off between the two.
+        known = {tuple(row[name] for name in KEY) for row in self.costs}
+        rows = _read(folder / "runs.csv", CURVES)
+        self.curves = [row for row in rows if tuple(row[name] for name in KEY) in known]
 
     def has(self, run: Run) -> bool:
         """Whether a run is finished.
@@ -235,19 +259,23 @@ def finished(
     """Perform runs, several at a time; gives each as it ends."""
     places = [folder / run.env / f"{run.method}-s{run.seed}" for run in runs]
     if cfg.engine == "here":
-        with ThreadPoolExecutor(cfg.processes or len(os.sched_getaffinity(0))) as pool:
-            jobs: dict[Any, Run] = {
-                pool.submit(perform, run, place): run
-                for run, place in zip(runs, places, strict=True)
-            }
+        pool = ThreadPoolExecutor(cfg.processes or len(os.sched_getaffinity(0)))
+        jobs: dict[Any, Run] = {
+            pool.submit(perform, run, place): run for run, place in zip(runs, places, strict=True)
+        }
+        try:
             for job in as_completed(jobs):
                 yield jobs[job], job
+        finally:
+            pool.shutdown(cancel_futures=True)
         return
     try:
         import submitit
     except ImportError:
         raise UsageError('submitit is missing: pip install "goalgan_bt[study]"') from None
     executor = submitit.AutoExecutor(folder=folder / "submitit")
+    if executor.cluster != "slurm":
+        raise UsageError("there is no SLURM here: leave --engine away")
     slurm = {} if cfg.partition is None else {"slurm_partition": cfg.partition}
     limits = {} if not cfg.processes else {"slurm_array_parallelism": cfg.processes}
     executor.update_parameters(cpus_per_task=1, timeout_min=24 * 60, **slurm, **limits)
@@ -279,9 +307,9 @@ def main() -> int:
             for i, (run, job) in enumerate(finished(cfg, missing, places), 1):
                 try:
                     coverage = tables.add(run, job.result())
-                except record.RunError as error:
+                except Exception as error:  # whatever became of one run, the others go on
                     failed += 1
-                    complain(str(error))
+                    complain((str(error).strip().splitlines() or [type(error).__name__])[-1])
                     continue
                 left = (time.monotonic() - began) / i * (len(missing) - i) / 60
                 say(

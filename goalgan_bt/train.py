@@ -118,7 +118,9 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
         learner.visited.add(visited)
         learner.gan.fit(visited, np.ones(len(visited), dtype=bool), cfg.gan.pretrain_steps)
     else:
-        collector.begin(learner.propose(test_env)[0])
+        anew, steps = learner.propose(test_env)
+        learner.steps["label"] += steps
+        collector.begin(anew)
 
     with Progress(f"{env.name}, seed {cfg.seed}") as terminal, Beside() as beside:
         last = False
@@ -134,7 +136,7 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
 
             for update in range(cfg.updates):
                 # Rollouts: every simulation goes on where it was. The backtracking model learns
-                # what preceded success.
+                # what preceded what.
                 with clock.measure("simulation"):
                     rollouts, episodes = collector.collect(policy, goals)
                 learner.steps["train"] += batch_steps
@@ -181,10 +183,12 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
 
             with clock.measure("learning"):
                 # Recall traces: imagine more ways of getting to those goals, and imitate them.
-                wanted = rng.permutation(goals[labels])[: cfg.backtracking.traces]
+                most = cfg.backtracking.traces if learner.recalls else 0
+                wanted = rng.permutation(goals[labels])[:most]
                 if cfg.backtracking.seeds == "values":
                     beside.wait("value")
-                    seeds = most_valuable(learner, env, cfg.backtracking.traces)
+                    seeds = most_valuable(learner, env, most)
+                    wanted = seeds.goals
                 else:
                     experienced, _ = learner.transitions.sample(SEED_STATES, rng)
                     seeds = decode(env, wanted, experienced, cfg.backtracking.max_shift, rng)
@@ -220,7 +224,7 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
                 learner.next_coverage = learner.steps["train"] + cfg.coverage.every
                 covered = float(measured.mean())
                 evaluation = {"coverage": covered, "coverage_deterministic": by_mean.mean()}
-                beside.metrics |= group("backtracking", checked.metrics())
+                evaluation = group("eval", evaluation) | group("backtracking", checked.metrics())
             with clock.measure("learning"):
                 beside.wait("gan")
                 if measure or ranks.size() > 1:  # else the value function has until the next batch
@@ -236,7 +240,7 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
                 | group("trpo", step)
                 | beside.metrics
                 | group("imitation", imitated)
-                | group("eval", evaluation)
+                | evaluation
                 | group("steps", learner.steps)
                 | group("time", clock.metrics(learner.steps["train"]))
                 | {
@@ -249,7 +253,7 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
                     "curriculum/estimated_coverage": mean(estimate),
                     "backtracking/traces": traces.valid.shape[1],
                     "backtracking/valid": mean(traces.valid),
-                    "backtracking/decoded": len(seeds.goals) / len(wanted) if len(wanted) else 0,
+                    "backtracking/decoded": len(seeds.goals) / max(1, len(wanted)),
                     "backtracking/shift": mean(seeds.shift),
                 }
             )

@@ -179,9 +179,7 @@ def test_a_resumed_learner_takes_new_learning_rates_and_buffers(tmp_path):
     checkpoint.load(learner, tmp_path)
     assert learner.value.optimiser.param_groups[0]["lr"] == 0.5
     rows = learner.transitions
-    rows.add(
-        *(np.ones((4, x.shape[1]), np.float32) for x in (rows.states, rows.actions, rows.states))
-    )
+    rows.add(*(np.ones_like(getattr(rows, name)[:4]) for name in rows.COLUMNS))
     assert np.abs(rows.states[: rows.size]).sum(axis=1).min() > 0  # no row of zeros
 
 
