@@ -213,7 +213,7 @@ def draw(
 ) -> Figure:
     """Coverage over training steps: interquartile mean and interval per method, a panel per
     environment, with what was published."""
-    figure = Figure(figsize=(7.5 * len(envs), 5), layout="constrained")
+    figure = Figure(figsize=(8.5 * len(envs), 5), layout="constrained")
     for ax, env in zip(figure.subplots(1, len(envs), squeeze=False)[0], envs, strict=True):
         for i, method in enumerate(methods):
             of = list(runs.get((env, method), {}).values())
@@ -233,5 +233,5 @@ def draw(
         ax.set(title=env, xlabel="million environment steps of training", ylim=(0, 1))
         ax.set_ylabel("coverage")
         ax.grid(alpha=0.25)
-        ax.legend(fontsize=7, frameon=False, loc="lower right")
+        ax.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
     return figure

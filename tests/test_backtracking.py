@@ -186,28 +186,30 @@ def test_consistency_by_hand():
     env = envs.make("point_umaze", 3, threads=1)
     ids = np.arange(3)
     env.reset(ids, np.zeros((3, 2)))
-    states, actions = [env.read_states(ids)], np.full((6, 3, 2), [1.0, 0.0])
+    states, actions = [env.read_states(ids)], np.full((30, 3, 2), [1.0, 0.0])
     for action in actions:
         env.advance(ids, action)
         states.append(env.read_states(ids))
     states = np.array(states)
     goals = env.achieved_goals(states[-1])
-    valid = np.ones((6, 3), bool)
-    valid[4:, 1] = False  # a trace that stopped early
+    valid = np.ones((30, 3), bool)
+    valid[20:, 1] = False  # a trace that stopped early
     backward = states[-2::-1].copy()
     backward[:, 2, 1] += 0.5  # beside the others: the last step misses the goal by that much
     traces = RecallTraces(backward, actions, valid, goals, states[-1])
     found = consistency(env, traces)
-    assert found.gap[:, 0] == pytest.approx(np.zeros(6), abs=1e-9)
-    assert np.isnan(found.gap[4:, 1]).all() and found.gap[:4, 1].max() < 1e-9
-    assert found.gap[:, 2] == pytest.approx([0.5, 0, 0, 0, 0, 0], abs=1e-9)
+    assert found.gap[:, 0] == pytest.approx(np.zeros(30), abs=1e-9)
+    assert np.isnan(found.gap[20:, 1]).all() and found.gap[:20, 1].max() < 1e-9
+    assert found.gap[:, 2] == pytest.approx([0.5] + [0] * 29, abs=1e-9)
     assert found.arrived.tolist() == [True, True, False]
-    assert found.moved[0, 0] == pytest.approx(
-        np.linalg.norm(states[6] - states[5], axis=1)[0], abs=0.1
-    )
+    step = np.linalg.norm(states[30] - states[29], axis=1)[0]
+    assert found.moved[0, 0] == pytest.approx(step, abs=0.1)
+    # A trace that begins on its goal proves nothing.
+    near = RecallTraces(backward[:3], actions[:3], valid[:3], goals, states[-1])
+    assert len(consistency(env, near).arrived) == 1  # the one beside the others
     metrics = found.metrics()
     assert metrics["arrived"] == pytest.approx(2 / 3)
-    assert metrics["gap"] == pytest.approx(0.5 / 16)
+    assert metrics["gap"] == pytest.approx(0.5 / 80)
 
 
 def test_relabelled_steps_of_a_trace_lead_to_a_later_place_of_it():

@@ -44,12 +44,12 @@ def test_only_imagined_successes_are_kept():
     env = envs.make("point_umaze", 200, threads=1)
     policy = Learner(env, config.preset("point_umaze")).policy
     rng = np.random.default_rng(0)
-    goals = rng.uniform(-0.9, 0.9, (200, 2))
+    goals = rng.uniform(-0.6, 0.6, (200, 2))
     states = np.zeros((200, 4))
     noise = torch.Generator().manual_seed(0)
     steps = imagine(Perfect(env), policy, env, states, goals, 25, noise)
     told = {tuple(goal): steps.states[(steps.goals == goal).all(axis=1)] for goal in steps.goals}
-    assert 5 < len(told) < 200  # some wander onto their goal, some do not
+    assert 3 < len(told) < 150  # some wander onto their goal, some do not
     for goal, path in told.items():
         gaps = np.linalg.norm(path[:, :2] - goal, axis=1)
         assert tuple(path[0, :2]) == (0, 0)

@@ -47,13 +47,26 @@ def test_ratios_are_paired_by_seed():
     """Seeds differ tenfold, each pair by a half: the interval is a point."""
     slow = [Curve(np.array([0, 1e6 * k, 9e7]), np.array([0, 0.5, 0.5])) for k in (1, 10, 4)]
     fast = [Curve(c.steps * [1, 0.5, 1], c.coverage) for c in slow]
-    value, reached = evidence.ratio(fast, slow, 0.5)
-    assert value == pytest.approx((0.5, 0.5, 0.5)) and reached == 6
-    value, reached = evidence.ratio(slow, fast, 0.5)
-    assert value == pytest.approx((2, 2, 2))
+    halved = evidence.ratio(fast, slow, 0.5)
+    assert halved.estimate == pytest.approx((0.5, 0.5, 0.5)) and halved.reached == (3, 3)
+    assert str(halved) == "0.50 [0.50, 0.50] (3, 3)"
+    assert evidence.ratio(slow, fast, 0.5).estimate == pytest.approx((2, 2, 2))
     never = [Curve(c.steps, c.coverage / 2) for c in slow]
-    value, reached = evidence.ratio(fast, never, 0.5)
-    assert reached == 3 and value.value < 0.1  # counted with all their steps
+    assert str(evidence.ratio(fast, never, 0.5)) == "(3, 0)"  # no figure: theirs never arrive
+
+
+@pytest.mark.parametrize("n", [5, 10])
+def test_the_ratios_interval_covers_the_truth_as_often_as_it_says(n):
+    rng = np.random.default_rng(0)
+    hits = 0
+    for _ in range(1000):
+        times = np.exp(rng.normal([[np.log(0.7)], [0.0]], 0.4, (2, n))) * 1e6
+        pair = [
+            [Curve(np.array([0, t, 1e9]), np.array([0, 0.5, 0.5])) for t in row] for row in times
+        ]
+        found = evidence.ratio(*pair, 0.5).estimate
+        hits += found.low <= 0.7 <= found.high
+    assert 0.93 < hits / 1000 < 0.97
 
 
 def test_the_interval_covers_the_truth_as_often_as_it_says():
@@ -121,24 +134,57 @@ def test_what_is_finished_is_not_run_again(finished, tmp_path):
 
 def test_a_run_that_was_cut_off_goes_on(finished, tmp_path):
     root, _ = finished
-    spec = study.load(str(root / "tiny.toml"))
-    run = study.grid(spec)[0]
+    run = study.grid(study.load(str(root / "tiny.toml")))[0]
     place = shutil.copytree(root / "runs/tiny/point_umaze/recall_traces-s0", tmp_path / "run")
     (folder,) = place.iterdir()
     (folder / "ended.txt").unlink()
-    longer = run._replace(flags=run.flags)
-    with pytest.raises(study.record.RunError, match="recall_traces, seed 0 failed: error: "):
-        study.perform(longer, place)  # it had reached its limit: there is nothing to go on with
-    (folder / "config.json").write_text(
-        (folder / "config.json").read_text().replace('"iterations": 3', '"iterations": 4')
-    )
-    assert study.perform(run, place) == folder
+    assert study.perform(run, place) == folder  # it was killed just before it could say so
+    longer = run._replace(flags=run.flags.replace("--iterations 3", "--iterations 4"))
+    with pytest.raises(study.record.RunError, match="was begun with other settings"):
+        study.perform(longer, place)
+    settings = (folder / "config.json").read_text()
+    (folder / "config.json").write_text(settings.replace('"iterations": 3', '"iterations": 4'))
+    assert study.perform(longer, place) == folder
     assert (folder / "metrics.csv").read_text().splitlines()[-1].startswith("4,")
+    assert (folder / "ended.txt").read_text().startswith("complete")
+
+
+def test_a_run_that_fails_says_why(tmp_path):
+    run = study.Run("point_umaze", "mine", 3, "--rollout.num-envs 8 --iterations 1")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(study.record.RunError, match="point_umaze, mine, seed 3 failed: error: can"):
+        study.perform(run._replace(flags=run.flags + f" --map {tmp_path}"), tmp_path / "runs")
+
+
+def test_two_studies_do_not_share_a_table(finished):
+    root, _ = finished
+    tables = study.Tables(root / "out/tiny")
+    words = "study", root / "tiny.toml", "--out", root / "out"
+    other = run_module(*words)
+    assert other.returncode == 2 and "another study's at work" in other.stderr
+    del tables
+
+
+def test_a_table_cut_off_between_its_files_mends_itself(finished, tmp_path):
+    root, _ = finished
+    out = shutil.copytree(root / "out/tiny", tmp_path / "tiny")
+    lines = (out / "costs.csv").read_text().splitlines(keepends=True)
+    (out / "costs.csv").write_text("".join(line for line in lines if ",goal_gan,0," not in line))
+    tables = study.Tables(out)
+    keys = {(row["method"], row["seed"]) for row in tables.curves}
+    assert len(keys) == 3 and ("goal_gan", "0") not in keys
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
+        (TINY.replace("seeds = 2", "seeds = true"), "seeds is a number"),
+        (TINY.replace("seeds = 2", "seeds = 2\nfirst_seed = -1"), "first_seed from 0"),
+        (TINY.replace("goal_gan =", '"../a" ='), "a method's name"),
+        (TINY.replace("--method goal_gan", "--seed 7"), "--seed is the study's own"),
+        (TINY.replace("--method goal_gan", "--help"), "--help is the study's own"),
+        (TINY.replace("--method goal_gan", "'"), "No closing quotation"),
+        (TINY.replace('["point_umaze"]', '["point_umaze", "point_umaze"]'), "each once"),
         ("envs = ", "cannot read"),
         ('envs = ["point_umaze"]\nseeds = 1', "needs methods"),
         ('envs = ["moon"]\nseeds = 1\n[methods]\na = ""', "moon"),
@@ -166,5 +212,5 @@ def test_unknown_and_unfinished_studies_end_in_one_line(tmp_path):
 @pytest.mark.parametrize("name", ["point_umaze", "ant_umaze", "ablations"])
 def test_the_studies_that_come_along_can_be_run(name):
     spec = study.load(name)
-    assert len(study.grid(spec)) == spec.seeds * len(spec.methods) * len(spec.envs)
+    assert len(study.grid(spec)) == len(spec.seeds) * len(spec.methods) * len(spec.envs)
     assert "recall_traces" in spec.methods
