@@ -61,10 +61,10 @@ PHASES = {
     "decoder and recall traces": (
         "goalgan_bt.train:decode",
         "goalgan_bt.train:recall_traces",
-        "goalgan_bt.backtracking:RecallTraces.pairs",
+        "goalgan_bt.backtracking:Steps.lesson",
     ),
     "imitation": ("goalgan_bt.imitation:Imitation.update",),
-    "evaluation": ("goalgan_bt.train:coverage",),
+    "evaluation": ("goalgan_bt.train:coverage", "goalgan_bt.train:consistency"),
     "recording": (
         "goalgan_bt.record:Record.metrics",
         "goalgan_bt.record:Record.frame",
