@@ -9,7 +9,7 @@ from goalgan_bt.train import train
 
 SHORT = (  # long enough for goals of intermediate difficulty, so that there are traces
     "--env point_umaze --iterations 4 --threads 1 --coverage.rollouts 1 --gan.pretrain-steps 20 "
-    "--gan.steps 20 --backtracking.min-transitions 100 --imitation.fade None"
+    "--gan.steps 20 --backtracking.min-transitions 100 --imitation.fade None --updates 4"
 )
 
 
