@@ -225,11 +225,14 @@ def draw(
             style = dict(color=f"C{i % 10}", linestyle="-" if i < 10 else "--")
             ax.plot(grid / 1e6, bounds[:, 0], label=f"{method} ({len(of)})", **style)
             ax.fill_between(grid / 1e6, *bounds[:, 1:].T, color=style["color"], alpha=0.12, lw=0)
-        for line in published({"env": env}):
+        for line, (x, side) in zip(
+            published({"env": env}), ((0, "left"), (1, "right")), strict=False
+        ):
             steps, level = line.last
             name = f"{line.method}, published, {steps / 1e6:.0f}M steps"
             ax.axhline(level, color="0.6", lw=0.8, ls=":")
-            ax.text(0, level, name, fontsize=7, color="0.4", va="bottom")
+            at = ax.get_yaxis_transform()  # x as a share of the axis, y as it is
+            ax.text(x, level, name, transform=at, fontsize=7, color="0.4", va="bottom", ha=side)
         ax.set(title=env, xlabel="million environment steps of training", ylim=(0, 1))
         ax.set_ylabel("coverage")
         ax.grid(alpha=0.25)
