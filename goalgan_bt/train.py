@@ -395,9 +395,11 @@ class Stop:
         self._old = {s: signal.signal(s, self._note) for s in (signal.SIGINT, signal.SIGTERM)}
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         for number, handler in self._old.items():
-            signal.signal(number, handler)
+            # After an error only the goodbye is left, which a launcher's `kill` shall not cut off.
+            last_words = kind is not None and number == signal.SIGTERM
+            signal.signal(number, signal.SIG_IGN if last_words else handler)
 
     def _note(self, number: int, _: FrameType | None) -> None:
         if self.requested and number == signal.SIGINT:

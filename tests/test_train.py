@@ -17,7 +17,7 @@ from conftest import run_module
 from goalgan_bt import checkpoint, config, record
 from goalgan_bt.learner import Learner
 from goalgan_bt.record import RunError
-from goalgan_bt.train import make_env, train
+from goalgan_bt.train import Stop, make_env, train
 
 TINY = {
     "point_umaze": "--rollout.num-envs 32 --rollout.steps 50 --backtracking.min-transitions 200",
@@ -326,3 +326,18 @@ def test_in_a_terminal_the_page_stays_until_ctrl_c(tmp_path):
     _, errors = process.communicate(timeout=60)
     os.close(master)
     assert process.returncode == 0 and errors == ""
+
+
+def test_after_an_error_a_launchers_kill_does_not_cut_off_the_last_words():
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        with pytest.raises(ValueError), Stop():
+            raise ValueError
+        os.kill(os.getpid(), signal.SIGTERM)  # torchrun's, when another rank has died
+        signal.signal(signal.SIGTERM, before)
+        with Stop() as stop:
+            os.kill(os.getpid(), signal.SIGTERM)
+            assert stop.requested
+        assert signal.getsignal(signal.SIGTERM) == before
+    finally:
+        signal.signal(signal.SIGTERM, before)
