@@ -20,8 +20,8 @@ import torch
 from goalgan_bt import checkpoint, config
 from goalgan_bt.command_line import UsageError, parse
 from goalgan_bt.coverage import coverage
-from goalgan_bt.learner import Learner
-from goalgan_bt.policy import Actor
+from goalgan_bt.envs.batch import GoalEnv
+from goalgan_bt.policy import Actor, GaussianPolicy
 from goalgan_bt.progress import complain
 from goalgan_bt.record import RunError
 from goalgan_bt.train import TEST_ENVS, make_env
@@ -46,21 +46,20 @@ class Settings:
     """Where to write the rows."""
 
 
-def learned(folder: Path) -> Learner:
-    """The learner of a run."""
-    cfg = config.load(folder)
-    learner = Learner(make_env(cfg, 1), cfg)
-    checkpoint.load(learner, folder)
-    return learner
+def learned(cfg: config.Config, env: GoalEnv, folder: Path) -> GaussianPolicy:
+    """The policy of a run."""
+    policy = GaussianPolicy(env.obs_dim, env.act_dim, cfg.policy)
+    checkpoint.load_policy(policy, folder)
+    return policy
 
 
 def integrators(folder: Path, rollouts: int) -> dict[str, float]:
     """Coverage of a run's policy under each integrator."""
-    cfg, learner, found = config.load(folder), learned(folder), {}
+    cfg, found = config.load(folder), {}
     for integrator in ("implicitfast", "rk4"):
         env = make_env(replace(cfg, integrator=integrator), TEST_ENVS)
         noise = torch.Generator().manual_seed(cfg.seed)
-        measured = coverage(env, learner.policy, env.test_goals(), rollouts, noise)
+        measured = coverage(env, learned(cfg, env, folder), env.test_goals(), rollouts, noise)
         found[integrator] = float(measured.stochastic.mean())
         found[f"{integrator}_deterministic"] = float(measured.deterministic.mean())
     return found
@@ -72,10 +71,10 @@ def in_gymnasium(folder: Path, episodes: int) -> dict[str, float]:
     import gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)
-    cfg, learner = config.load(folder), learned(folder)
+    cfg = config.load(folder)
     ours = make_env(cfg, 1)
     theirs = gymnasium.make("PointMaze_UMaze-v3", continuing_task=False)
-    act, successes = Actor(learner.policy), np.zeros((len(CELLS), episodes))
+    act, successes = Actor(learned(cfg, ours, folder)), np.zeros((len(CELLS), episodes))
     for i, cell in enumerate(CELLS):
         for episode in range(episodes):
             options = {"reset_cell": np.array(START), "goal_cell": np.array(cell)}

@@ -196,6 +196,11 @@ class GoalEnv:
         states = self.read_states(ids)
         return self.judge(states, actions, goals, self._feasible[ids], self.elapsed[ids])
 
+    def reached(self, achieved: Array, goals: Array) -> Array:
+        """Whether places are within `success_radius` of goals, both (n, goal_dim), (n,)."""
+        squared = namespace(achieved).square(achieved - goals).sum(axis=1)
+        return squared < self.success_radius**2
+
     def judge(
         self, states: Array, actions: Array, goals: Array, feasible: Array, elapsed: Array
     ) -> Step:
@@ -211,8 +216,7 @@ class GoalEnv:
         healthy = self.healthy(states)
         with np.errstate(invalid="ignore"):  # a diverged state is as far as can be
             achieved = self.achieved_goals(states)
-            distance = xp.square(achieved - goals).sum(axis=1)
-            success = healthy & feasible & (distance < self.success_radius**2)
+            success = healthy & feasible & self.reached(achieved, goals)
             obs = self.observations(states, goals, achieved)
         terminated = success | ~healthy
         truncated = ~terminated & (elapsed >= self.horizon)

@@ -354,12 +354,12 @@ def consistency(env: GoalEnv, traces: RecallTraces) -> Consistency:
     for t in reversed(range(length)):
         begins = ids[valid[t] & (~valid[t + 1] if t + 1 < length else True)]
         far = env.achieved_goals(traces.states[t, begins])
-        away[begins] = _distance(far, goals[begins]) >= env.success_radius
+        away[begins] = ~env.reached(far, goals[begins])
         env.reset(begins, goals[begins], traces.states[t, begins])
         some = ids[valid[t] & ~arrived]
         env.advance(some, traces.actions[t, some])
         here = env.achieved_goals(env.read_states(some))
-        arrived[some] = _distance(here, goals[some]) < env.success_radius
+        arrived[some] = env.reached(here, goals[some])
         steps += len(some) * env.action_repeat
     return Consistency(gap, moved, arrived[away], steps)
 

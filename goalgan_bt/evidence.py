@@ -6,7 +6,6 @@ and method (environments are never mixed, so that is their stratified bootstrap)
 """
 
 import io
-from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -61,13 +60,14 @@ def iqm(x: FloatArray, axis: int = 0) -> NDArray[np.float64]:
     return np.asarray(stats.trim_mean(x, 0.25, axis=axis))
 
 
-def interval(x: FloatArray, statistic: Callable[..., FloatArray] = iqm) -> Interval:
-    """A statistic of a sample (n,) and its bootstrap interval; NaN bounds for a single value."""
+def interval(x: FloatArray) -> Interval:
+    """Interquartile mean of a sample (n,) and its bootstrap interval; NaN bounds for a single
+    value."""
     if len(x) < 2:
-        return Interval(float(statistic(x)), np.nan, np.nan)
+        return Interval(float(iqm(x)), np.nan, np.nan)
     rows = np.random.default_rng(0).integers(len(x), size=(RESAMPLES, len(x)))
-    low, high = np.percentile(statistic(x[rows], axis=1), [2.5, 97.5])
-    return Interval(float(statistic(x)), float(low), float(high))
+    low, high = np.percentile(iqm(x[rows], axis=1), [2.5, 97.5])
+    return Interval(float(iqm(x)), float(low), float(high))
 
 
 def time_to(curve: Curve, threshold: float) -> float:
@@ -83,6 +83,11 @@ def time_to(curve: Curve, threshold: float) -> float:
 def area(curve: Curve) -> float:
     """Mean coverage over the run."""
     return float(np.trapezoid(curve.coverage, curve.steps) / curve.steps[-1])
+
+
+def areas(seeds: dict[int, Curve]) -> FloatArray:
+    """Mean coverage of each run of a method, (n,)."""
+    return np.array([area(curve) for curve in seeds.values()])
 
 
 class Ratio(NamedTuple):
@@ -129,17 +134,19 @@ def curves(tables: "Tables") -> dict[tuple[str, str], dict[int, Curve]]:
 
 def report(study: "Study", tables: "Tables") -> None:
     """Write README.md, summary.csv and curves.png beside the tables of a study."""
-    runs, rows = curves(tables), []
+    runs = curves(tables)
+    rows: list[dict[str, str]] = []
     text = [f"# Study {study.name}", "", f"From `python -m goalgan_bt.study {study.name}`."]
     envs = [env for env in study.envs if any((env, method) in runs for method in study.methods)]
     if not envs:
         raise UsageError(f"{tables.folder} holds no run of this study's methods")
     for env in envs:
         of = {method: runs[env, method] for method in study.methods if (env, method) in runs}
-        here = [_row(env, method, seeds, tables) for method, seeds in of.items()]
-        rows += here
-        here = sorted(here, key=lambda row: -float(row["area"].split()[0]))
-        text += ["", f"## {env}", "", *_markdown(here), "", *_ratios(of)]
+        here = {method: _row(env, method, seeds, tables) for method, seeds in of.items()}
+        rows += here.values()
+        best_first = sorted(here, key=lambda method: -iqm(areas(of[method])))
+        table = _markdown([here[method] for method in best_first])
+        text += ["", f"## {env}", "", *table, "", *_ratios(of)]
     commits = sorted({row["commit"][:12] for row in tables.costs})
     text += [
         "",
@@ -165,7 +172,7 @@ def _row(env: str, method: str, seeds: dict[int, Curve], tables: "Tables") -> di
         "env": env,
         "method": method,
         "seeds": str(len(of)),
-        "area": str(interval(np.array([area(curve) for curve in of]))),
+        "area": str(interval(areas(seeds))),
         "at the end": str(interval(np.array([curve.coverage[-1] for curve in of]))),
     }
     for threshold in THRESHOLDS:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from goalgan_bt.backtracking import Scale, Steps, Transitions, learn_gaussian, sample_gaussian
 from goalgan_bt.envs.batch import GoalEnv
-from goalgan_bt.envs.maze import BoolArray, FloatArray
+from goalgan_bt.envs.maze import FloatArray
 from goalgan_bt.mlp import MLP, RELU
 from goalgan_bt.policy import Actor, GaussianPolicy
 from goalgan_bt.settings import BacktrackingConfig
@@ -90,7 +90,7 @@ def imagine(
     if n == 0:
         return Steps(states, np.empty((0, env.act_dim)), goals)
     act, successful = Actor(policy), np.zeros(n, dtype=bool)
-    alive = ~_reached(env, states, goals)
+    alive = ~env.reached(env.achieved_goals(states), goals)
     visited = np.zeros((length, n, env.state_dim))
     actions = np.zeros((length, n, env.act_dim))
     taken = np.zeros((length, n), dtype=bool)
@@ -103,14 +103,9 @@ def imagine(
         following = env.repair(model.successors(s, a).double().numpy())
         alive = alive & env.valid(following)
         states = np.where(alive[:, None], following, states)
-        reached = alive & _reached(env, states, goals)
+        reached = alive & env.reached(env.achieved_goals(states), goals)
         successful |= reached
         alive &= ~reached
     kept = taken & successful
     spread = np.broadcast_to(goals, (length, n, env.goal_dim))
     return Steps(visited[kept], actions[kept], spread[kept])
-
-
-def _reached(env: GoalEnv, states: FloatArray, goals: FloatArray) -> BoolArray:
-    gap = np.linalg.norm(env.achieved_goals(states) - goals, axis=1)
-    return np.asarray(gap < env.success_radius)

@@ -144,7 +144,7 @@ class Learner:
 
     def _modules(self) -> dict[str, Any]:
         """Everything with torch's `state_dict` and `load_state_dict`: networks, optimisers."""
-        return {
+        modules: dict[str, Any] = {
             "policy": self.policy,
             "value": self.value,
             "value_optimiser": self.value.optimiser,
@@ -155,11 +155,10 @@ class Learner:
             "backtracking": self.backtracking,
             "backtracking_optimiser": self.backtracking.optimiser,
             "imitation_optimiser": self.imitation.optimiser,
-        } | (
-            {}
-            if self.forward is None
-            else {"forward": self.forward, "forward_optimiser": self.forward.optimiser}
-        )
+        }
+        if self.forward is not None:
+            modules |= {"forward": self.forward, "forward_optimiser": self.forward.optimiser}
+        return modules
 
     def tensors(self) -> list[Tensor]:
         """Every network's parameters and buffers, as they are held."""

@@ -51,7 +51,7 @@ def oracle(
     return goals[good] if good.any() else goals, steps
 
 
-STATE = ("goals", "success", "recent_goals", "recent_success")
+STATE = ("goals", "success", "recent_goals", "recent_success", "points", "seed")
 
 
 class AlpGmm:
@@ -85,6 +85,7 @@ class AlpGmm:
         self._low, self._high, self._rng = low, high, rng
         self._goals, self._success = np.empty((0, len(low))), np.empty(0)
         self._recent, self._outcomes = self._goals, self._success  # not yet in a mixture
+        self._points, self._fit_seed = np.empty((0, len(low) + 1)), 0  # of the mixture
         self._fitted = None
 
     def add(self, goals: FloatArray, success: BoolArray) -> None:
@@ -96,37 +97,31 @@ class AlpGmm:
         if len(self._goals):
             nearest = self._tree(self._goals).query(self._recent, return_distance=False)[:, 0]
             progress = np.abs(self._outcomes - self._success[nearest])
-            self._fit(np.column_stack([self._recent, progress])[-self.WINDOW :])
+            self._points = np.column_stack([self._recent, progress])[-self.WINDOW :]
+            self._fit_seed = int(self._rng.integers(2**31))
+            self._fit()
         self._goals = np.concatenate([self._goals, self._recent])
         self._success = np.concatenate([self._success, self._outcomes])
         self._recent, self._outcomes = self._recent[:0], self._outcomes[:0]
 
-    def _fit(self, points: FloatArray) -> None:
-        seed = int(self._rng.integers(2**31))
-        mixtures = [
-            self._mixture(k, reg_covar=1e-4, init_params="random_from_data", random_state=seed).fit(
-                points
-            )
-            for k in self.COMPONENTS
-        ]
-        self._fitted = min(mixtures, key=lambda mixture: mixture.aic(points))
+    def _fit(self) -> None:
+        how = dict(reg_covar=1e-4, init_params="random_from_data", random_state=self._fit_seed)
+        mixtures = [self._mixture(k, **how).fit(self._points) for k in self.COMPONENTS]
+        self._fitted = min(mixtures, key=lambda mixture: mixture.aic(self._points))
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """All that was tried; the mixture is fitted anew from it."""
-        columns = self._goals, self._success, self._recent, self._outcomes
+        """All that was tried, and what the mixture is fitted anew from."""
+        tried = self._goals, self._success, self._recent, self._outcomes
+        columns = (*tried, self._points, np.array(self._fit_seed))
         return dict(zip(STATE, map(torch.from_numpy, columns), strict=True))
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Take over what `state_dict` gave."""
-        self._goals, self._success, self._recent, self._outcomes = (
-            state[name].numpy().copy() for name in STATE
-        )
-        older, newer = self._goals[: -self.WINDOW], self._goals[-self.WINDOW :]
-        if len(older):
-            known = self._success[: len(older)]
-            nearest = self._tree(older).query(newer, return_distance=False)[:, 0]
-            progress = np.abs(self._success[len(older) :] - known[nearest])
-            self._fit(np.column_stack([newer, progress]))
+        *tried, self._points, seed = (state[name].numpy().copy() for name in STATE)
+        self._goals, self._success, self._recent, self._outcomes = tried
+        self._fit_seed = int(seed)
+        if len(self._points):
+            self._fit()
 
     def sample(self, n: int) -> FloatArray:
         """Goals in the box, (n, goal_dim)."""

@@ -35,9 +35,9 @@ from goalgan_bt.progress import complain, say
 
 SHIPPED = Path(__file__).parent / "studies"
 KEY = ("env", "method", "seed")
-CURVES = ("env", "method", "seed", "steps", "coverage")  # columns of runs.csv, a row per report
+CURVES = (*KEY, "steps", "coverage")  # columns of runs.csv, a row per report
 OURS = {"--env", "--seed", "--out", "--resume", "--viz", "--threads", "--help", "-h"}
-COSTS = ("env", "method", "seed", "flags", "commit", "train", "label", "eval", "seconds")
+COSTS = (*KEY, "flags", "commit", "train", "label", "eval", "seconds")  # of costs.csv
 
 
 class Study(NamedTuple):
@@ -109,10 +109,10 @@ def load(name: str) -> Study:
         raise UsageError(f"{wrong}it has an unknown key {unknown.pop()!r}")
     flags, first = table.get("flags", ""), table.get("first_seed", 0)
     texts = [*table["envs"], *table["methods"].values(), flags]
-    if not all(isinstance(text, str) for text in texts) or len({*table["envs"]}) < len(
-        table["envs"]
-    ):
-        raise UsageError(f"{wrong}environments (each once) and flags are texts")
+    if not all(isinstance(text, str) for text in texts):
+        raise UsageError(f"{wrong}environments and flags are texts")
+    if len(set(table["envs"])) < len(table["envs"]):
+        raise UsageError(f"{wrong}it names an environment twice")
     if type(table["seeds"]) is not int or table["seeds"] < 1 or type(first) is not int or first < 0:
         raise UsageError(f"{wrong}seeds is a number from 1 on, first_seed from 0 on")
     if bad := [name for name in table["methods"] if not re.fullmatch(r"\w[\w.+-]*", name)]:
@@ -203,9 +203,8 @@ class Tables:
             raise record.RunError(f"{folder} is another study's at work: wait for it") from None
         self.costs = _read(folder / "costs.csv", COSTS)
         # Costs are written last: what has none was cut off between the two.
-        known = {tuple(row[name] for name in KEY) for row in self.costs}
-        rows = _read(folder / "runs.csv", CURVES)
-        self.curves = [row for row in rows if tuple(row[name] for name in KEY) in known]
+        known = {_key(row) for row in self.costs}
+        self.curves = [row for row in _read(folder / "runs.csv", CURVES) if _key(row) in known]
 
     def has(self, run: Run) -> bool:
         """Whether a run is finished.
@@ -214,7 +213,7 @@ class Tables:
             UsageError: if it was made with other flags.
         """
         for row in self.costs:
-            if (row["env"], row["method"], row["seed"]) == run.key:
+            if _key(row) == run.key:
                 if row["flags"] != run.flags:
                     raise UsageError(
                         f"{self.folder} holds {run.method} of {run.env} with the flags "
@@ -226,7 +225,7 @@ class Tables:
     def add(self, run: Run, folder: Path) -> float:
         """Take in a finished run; its last coverage."""
         _, rows = record.read_metrics(folder)
-        key = dict(zip(CURVES, run.key, strict=False))
+        key = dict(zip(KEY, run.key, strict=True))
         reports = [row for row in rows if row.get("eval/coverage")]
         self.curves += [
             key | {"steps": row["steps/train"], "coverage": row["eval/coverage"]} for row in reports
@@ -241,6 +240,10 @@ class Tables:
         record.write_table(self.folder / "runs.csv", CURVES, self.curves)
         record.write_table(self.folder / "costs.csv", COSTS, self.costs)
         return float(reports[-1]["eval/coverage"])
+
+
+def _key(row: dict[str, str]) -> tuple[str, ...]:
+    return tuple(row[name] for name in KEY)
 
 
 def _read(path: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:

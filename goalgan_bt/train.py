@@ -136,7 +136,7 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
 
             for update in range(cfg.updates):
                 # Rollouts: every simulation goes on where it was. The backtracking model learns
-                # what preceded what.
+                # from what they add to the agent's experience.
                 with clock.measure("simulation"):
                     rollouts, episodes = collector.collect(policy, goals)
                 learner.steps["train"] += batch_steps

@@ -51,6 +51,21 @@ def test_alp_gmm_seeks_where_outcomes_change():
     assert x.min() >= 0 and x.max() <= 1 and (x < 0.3).any() and (x > 0.7).any()
 
 
+def test_alp_gmm_goes_on_where_it_was_saved():
+    pytest.importorskip("sklearn")
+    rng = np.random.default_rng(0)
+    teacher, heir = (AlpGmm(np.zeros(2), np.ones(2), np.random.default_rng(1)) for _ in range(2))
+    for _ in range(3):
+        teacher.add(goals := teacher.sample(300), rng.random(300) < goals[:, 0])
+    heir._rng.bit_generator.state = teacher._rng.bit_generator.state
+    heir.load_state_dict(teacher.state_dict())
+    for _ in range(2):
+        goals = teacher.sample(300)
+        np.testing.assert_array_equal(heir.sample(300), goals)
+        for each in (teacher, heir):
+            each.add(goals, goals[:, 0] > 0.5)
+
+
 @pytest.mark.parametrize("source", ["gan", "gan_fit_all", "uniform", "feasible", "alp_gmm"])
 def test_every_source_gives_goals_in_the_box(source):
     if source == "alp_gmm":
