@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from goalgan_bt.study import Study, Tables
 
 THRESHOLDS = (0.3, 0.48, 0.63, 0.9)  # coverage; 0.48 and 0.63 are Goyal et al. 2019's
-# Whom times are compared with: all methods with the first, those with traces with the others.
+# Whom times are compared with: all methods with the first of these, those with traces with the
+# others; where a study has none of them, all with its own first method.
 REFERENCES = ("goal_gan", "self_imitation", "hindsight")
 RESAMPLES = 5000
 
@@ -192,10 +193,11 @@ def _markdown(rows: list[dict[str, str]]) -> list[str]:
 
 def _ratios(of: dict[str, dict[int, Curve]]) -> list[str]:
     lines = []
-    for reference in REFERENCES:
+    references = [method for method in REFERENCES if method in of] or [next(iter(of))]
+    for reference in references:
         for method in of:
-            seeds = sorted(set(of[method]) & set(of.get(reference, {})))
-            traced = method.startswith("recall_traces") or reference == REFERENCES[0]
+            seeds = sorted(set(of[method]) & set(of[reference]))
+            traced = method.startswith("recall_traces") or reference == references[0]
             if method == reference or not seeds or not traced:
                 continue
             cells = []
