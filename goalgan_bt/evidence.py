@@ -6,14 +6,17 @@ and method (environments are never mixed, so that is their stratified bootstrap)
 """
 
 import io
-from typing import TYPE_CHECKING, NamedTuple
+import math
+import shlex
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
-from goalgan_bt import record
+from goalgan_bt import config, record
 from goalgan_bt.command_line import UsageError
 from goalgan_bt.envs.maze import FloatArray
 from goalgan_bt.viz.published import published
@@ -220,30 +223,66 @@ def _ratios(of: dict[str, dict[int, Curve]]) -> list[str]:
 def draw(
     envs: list[str], runs: dict[tuple[str, str], dict[int, Curve]], methods: list[str]
 ) -> Figure:
-    """Coverage over training steps: interquartile mean and interval per method, a panel per
-    environment, with what was published."""
-    figure = Figure(figsize=(8.5 * len(envs), 5), layout="constrained")
-    for ax, env in zip(figure.subplots(1, len(envs), squeeze=False)[0], envs, strict=True):
-        for i, method in enumerate(methods):
-            of = list(runs.get((env, method), {}).values())
-            if not of:
-                continue
-            grid = np.linspace(0, min(curve.steps[-1] for curve in of), 60)
-            y = np.array([np.interp(grid, *curve) for curve in of])
-            bounds = np.array([interval(column) for column in y.T])
-            style = dict(color=f"C{i % 10}", linestyle="-" if i < 10 else "--")
-            ax.plot(grid / 1e6, bounds[:, 0], label=f"{method} ({len(of)})", **style)
-            ax.fill_between(grid / 1e6, *bounds[:, 1:].T, color=style["color"], alpha=0.12, lw=0)
-        for line, (x, side) in zip(
-            published({"env": env}), ((0, "left"), (1, "right")), strict=False
-        ):
-            steps, level = line.last
-            name = f"{line.method}, published, {steps / 1e6:.0f}M steps"
-            ax.axhline(level, color="0.6", lw=0.8, ls=":")
-            at = ax.get_yaxis_transform()  # x as a share of the axis, y as it is
-            ax.text(x, level, name, transform=at, fontsize=7, color="0.4", va="bottom", ha=side)
-        ax.set(title=env, xlabel="million environment steps of training", ylim=(0, 1))
-        ax.set_ylabel("coverage")
-        ax.grid(alpha=0.25)
-        ax.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
+    """Coverage over training steps, a panel per environment; where there are more than two, also
+    coverage at the end over environments."""
+    panels = len(envs) + (len(envs) > 2)
+    across = min(panels, 2)
+    down = math.ceil(panels / across)
+    figure = Figure(figsize=(8.5 * across, 5 * down), layout="constrained")
+    axes = figure.subplots(down, across, squeeze=False).flat
+    for ax, env in zip(axes, envs, strict=False):
+        _curves(ax, env, {method: runs.get((env, method), {}) for method in methods})
+    if panels > len(envs):
+        _ends(axes[len(envs)], envs, runs, methods)
+    for ax in axes[panels:]:
+        ax.set_axis_off()
     return figure
+
+
+def _curves(ax: Axes, env: str, of: dict[str, dict[int, Curve]]) -> None:
+    """Interquartile mean and interval per method, and what was published."""
+    for i, (method, seeds) in enumerate(of.items()):
+        if not seeds:
+            continue
+        grid = np.linspace(0, min(curve.steps[-1] for curve in seeds.values()), 60)
+        y = np.array([np.interp(grid, *curve) for curve in seeds.values()])
+        bounds = np.array([interval(column) for column in y.T])
+        style = _style(i)
+        ax.plot(grid / 1e6, bounds[:, 0], label=f"{method} ({len(seeds)})", **style)
+        ax.fill_between(grid / 1e6, *bounds[:, 1:].T, color=style["color"], alpha=0.12, lw=0)
+    cfg = config.from_command_line(["--env", *shlex.split(env)])
+    lines = published({"env": cfg.env, "dim": cfg.dim})
+    for line, (x, side) in zip(lines, ((0, "left"), (1, "right")), strict=False):
+        steps, level = line.last
+        name = f"{line.method}, published, {steps / 1e6:.0f}M steps"
+        ax.axhline(level, color="0.6", lw=0.8, ls=":")
+        at = ax.get_yaxis_transform()  # x as a share of the axis, y as it is
+        ax.text(x, level, name, transform=at, fontsize=7, color="0.4", va="bottom", ha=side)
+    ax.set(title=env, xlabel="million environment steps of training", ylabel="coverage")
+    _finish(ax)
+
+
+def _ends(
+    ax: Axes, envs: list[str], runs: dict[tuple[str, str], dict[int, Curve]], methods: list[str]
+) -> None:
+    """Coverage at the end over environments: interquartile mean and interval per method."""
+    for i, method in enumerate(methods):
+        there = [j for j, env in enumerate(envs) if (env, method) in runs]
+        ends = [[run.coverage[-1] for run in runs[envs[j], method].values()] for j in there]
+        found = np.array([interval(np.array(end)) for end in ends]).reshape(-1, 3)
+        value, low, high = found.T
+        x = np.array(there) + 0.04 * (i - len(methods) / 2)  # so that no bar hides another
+        ax.errorbar(x, value, (value - low, high - value), label=method, capsize=3, **_style(i))
+    ax.set_xticks(range(len(envs)), envs)
+    ax.set(title="at the end", ylabel="coverage")
+    _finish(ax)
+
+
+def _style(i: int) -> dict[str, Any]:
+    return {"color": f"C{i % 10}", "linestyle": "-" if i < 10 else "--"}
+
+
+def _finish(ax: Axes) -> None:
+    ax.set_ylim(0, 1.02)
+    ax.grid(alpha=0.25)
+    ax.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))

@@ -84,7 +84,10 @@ class Learner:
                 return feasible(env, n, self.rng), 0
             case "oracle":
                 return oracle(env, self.policy, self.cfg, self.rng, self.noise["evaluation"])
-        return self.gan.sample(n), 0
+        goals = self.gan.sample(n)
+        if k := round(self.cfg.anywhere * n):
+            goals[:k] = self.rng.uniform(*self._box, (k, env.goal_dim))
+        return goals, 0
 
     def fit_model(self) -> dict[str, float]:
         """Let the model whose steps are imitated learn from the transitions."""

@@ -8,7 +8,7 @@ Each is a set of values for settings by name; what is not named is as in the def
 from typing import Any
 
 NO_TRACES = {"backtracking.trace_length": 0}
-NO_REPLAY = NO_TRACES | {"goals.old": 0}
+NO_REPLAY = NO_TRACES | {"goals.old": 0, "goals.label_rollouts": 0}  # nothing learns from labels
 
 METHODS: dict[str, dict[str, Any]] = {
     "recall_traces": {},

@@ -69,6 +69,9 @@ class GoalsConfig:
     """Goals reached more often are mastered (Florensa 2018)."""
     new: int = 200
     """Proposed goals per iteration."""
+    anywhere: float = 0.0
+    """Share of them that is uniform over the box, so that a GAN which has closed in on mastered
+    goals hears of others (the original: 0)."""
     old: int = 100
     """Goals from the replay per iteration."""
     labelled: int = 1000

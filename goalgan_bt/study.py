@@ -2,9 +2,10 @@
 
     python -m goalgan_bt.study point_umaze
 
-A study is a small TOML file: environments, a number of seeds, flags for all, and methods by name,
-each with the flags of `goalgan_bt.train` that make it. Every run is a process of one thread. What
-is finished stands in `runs.csv` and is not run again; what was cut off goes on from its checkpoint.
+A study is a small TOML file: environments (with flags of their own: "point_nd --dim 4"), a number
+of seeds, flags for all, and methods by name, each with the flags of `goalgan_bt.train` that make
+it. Every run is a process of one thread. What is finished stands in `runs.csv` and is not run
+again; what was cut off goes on from its checkpoint.
 """
 
 import os
@@ -41,7 +42,8 @@ COSTS = (*KEY, "flags", "commit", "train", "label", "eval", "seconds")  # of cos
 
 
 class Study(NamedTuple):
-    """name: of the file; envs, methods (name -> flags), seeds: the grid; flags: of all."""
+    """name: of the file; envs, methods (name -> flags), seeds: the grid; flags: of all. An
+    environment may have flags of its own behind its name."""
 
     name: str
     envs: list[str]
@@ -69,7 +71,7 @@ class StudyConfig:
     """Run a study, or what is missing of it, and write its tables, report and picture."""
 
     study: tyro.conf.Positional[str]
-    """A TOML file, or one of those that come along: point_umaze, ant_umaze, ablations."""
+    """A TOML file, or one of those that come along: point_umaze, ant_umaze, point_nd, ablations."""
     out: Path = Path("docs/studies")
     """Where tables and report go, in a folder with the study's name."""
     runs: Path = Path("runs/studies")
@@ -121,7 +123,8 @@ def load(name: str) -> Study:
     study = Study(path.stem, table["envs"], table["methods"], seeds, flags)
     for run in grid(study._replace(seeds=seeds[:1])):
         try:
-            if given := {word.split("=")[0] for word in shlex.split(run.flags)} & OURS:
+            flags = shlex.split(f"{run.env} {run.flags}")
+            if given := {word.split("=")[0] for word in flags} & OURS:
                 raise UsageError(f"{given.pop()} is the study's own")
             config.from_command_line(words(run))
         except ValueError as error:  # UsageError is one
@@ -141,8 +144,8 @@ def grid(study: Study) -> list[Run]:
 
 def words(run: Run) -> list[str]:
     """The flags of `goalgan_bt.train` for a run."""
-    common = ["--env", run.env, "--seed", str(run.seed), "--threads", "1", "--viz", "none"]
-    return common + shlex.split(run.flags)
+    common = ["--seed", str(run.seed), "--threads", "1", "--viz", "none"]
+    return ["--env", *shlex.split(run.env), *common, *shlex.split(run.flags)]
 
 
 def perform(run: Run, folder: Path) -> Path:
@@ -260,7 +263,7 @@ def finished(
     cfg: StudyConfig, runs: list[Run], folder: Path
 ) -> Iterator[tuple[Run, "Future[Path]"]]:
     """Perform runs, several at a time; gives each as it ends."""
-    places = [folder / run.env / f"{run.method}-s{run.seed}" for run in runs]
+    places = [folder / run.env.replace(" ", "_") / f"{run.method}-s{run.seed}" for run in runs]
     if cfg.engine == "here":
         pool = ThreadPoolExecutor(cfg.processes or len(os.sched_getaffinity(0)))
         jobs: dict[Any, Run] = {

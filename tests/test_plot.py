@@ -24,6 +24,7 @@ def test_the_maps_tiles_fill_the_free_cells(folder):
     figure = pictures.overview([folder], maps=2)
     ax = figure.axes[0]
     assert len(ax.patches) == 112
+    assert ax.get_ylabel() == "point_umaze\nrecall_traces\ns0"  # what run it is
     assert ax.patches[0].get_width() == pytest.approx(0.5)
 
 

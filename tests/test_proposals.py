@@ -76,3 +76,18 @@ def test_every_source_gives_goals_in_the_box(source):
     goals, steps = Learner(env, cfg).propose(env)
     assert goals.shape == (cfg.goals.new, 2) and steps == 0
     assert (goals >= env.goal_low).all() and (goals <= env.goal_high).all()
+
+
+def test_a_share_of_the_goals_lies_anywhere():
+    """What a GAN knows nothing of is proposed all the same; the rest still comes from it."""
+    cfg = config.preset("point_nd")
+    assert cfg.goals.anywhere == 0.1 and config.preset("point_umaze").goals.anywhere == 0
+    env = make_env(cfg, 1)
+    here = np.full((500, 2), [0.3, 3.0])
+    found = []
+    for share in (0.0, 0.25):
+        learner = Learner(env, replace(cfg, goals=replace(cfg.goals, anywhere=share)))
+        learner.gan.fit(here, np.ones(len(here), dtype=bool), 200)
+        goals, _ = learner.propose(env)
+        found.append((np.linalg.norm(goals - here[0], axis=1) > 2.0).mean())
+    assert found[0] < 0.02 and 0.18 < found[1] < 0.25

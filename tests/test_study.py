@@ -182,6 +182,7 @@ def test_a_table_cut_off_between_its_files_mends_itself(finished, tmp_path):
         (TINY.replace("seeds = 2", "seeds = 2\nfirst_seed = -1"), "first_seed from 0"),
         (TINY.replace("goal_gan =", '"../a" ='), "a method's name"),
         (TINY.replace("--method goal_gan", "--seed 7"), "--seed is the study's own"),
+        (TINY.replace('"point_umaze"', '"point_umaze --seed 7"'), "--seed is the study's own"),
         (TINY.replace("--method goal_gan", "--help"), "--help is the study's own"),
         (TINY.replace("--method goal_gan", "'"), "No closing quotation"),
         (TINY.replace('["point_umaze"]', '["point_umaze", "point_umaze"]'), "twice"),
@@ -209,7 +210,7 @@ def test_unknown_and_unfinished_studies_end_in_one_line(tmp_path):
         assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize("name", ["point_umaze", "ant_umaze", "ablations"])
+@pytest.mark.parametrize("name", ["point_umaze", "ant_umaze", "point_nd", "ablations"])
 def test_the_studies_that_come_along_can_be_run(name):
     spec = study.load(name)
     assert len(study.grid(spec)) == len(spec.seeds) * len(spec.methods) * len(spec.envs)

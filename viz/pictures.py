@@ -38,8 +38,9 @@ def coverage_curve(ax: Axes, folders: list[Path], until: int | None = None) -> N
         steps = [float(row.get("steps/train") or "nan") for row in rows]
         coverage = [float(row["eval/coverage"]) for row in rows]
         coverage[known:] = [math.nan] * (len(rows) - known)
-        ax.plot(steps, coverage, color=f"C{i}", label=folder.name, marker=".", markersize=4)
-        references |= dict.fromkeys(published(Run(folder).settings))
+        run = Run(folder)
+        ax.plot(steps, coverage, color=f"C{i}", label=_title(run), marker=".", markersize=4)
+        references |= dict.fromkeys(published(run.settings))
     for line, grey in zip(references, ("0.65", "0.35") * 9, strict=False):
         label = f"{line.method} (published)"
         ax.plot(*zip(*line.points, strict=True), "o--", color=grey, markersize=3, label=label)
@@ -47,6 +48,12 @@ def coverage_curve(ax: Axes, folders: list[Path], until: int | None = None) -> N
     ax.set(xlabel="environment steps of training", ylabel="coverage", ylim=(0, 1))
     ax.grid(alpha=0.25)
     ax.legend(fontsize=7, frameon=False, loc="upper left")
+
+
+def _title(run: Run) -> str:
+    """What tells a run from others, in three words."""
+    known = [run.settings.get(name) for name in ("env", "method", "seed")]
+    return run.name if None in known else "{} {} s{}".format(*known)
 
 
 def coverage_map(ax: Axes, folder: Path, frame: Path, goals: float = 7.0) -> Any:
@@ -127,7 +134,7 @@ def overview(folders: list[Path], maps: int = 4, at: tuple[int, ...] = ()) -> Fi
         axes = [figure.add_subplot(grid[r, c]) for c in range(len(picks))]
         for ax, pick in zip(axes, picks, strict=True):
             image = coverage_map(ax, folder, frames[pick])
-        axes[0].set_ylabel(folder.name, fontsize=7)
+        axes[0].set_ylabel(_title(Run(folder)).replace(" ", "\n"), fontsize=7)
         axes[0].legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=3)
         figure.colorbar(image, ax=axes, label="success", shrink=0.8)
     coverage_curve(figure.add_subplot(grid[rows, :]), folders)
