@@ -40,6 +40,17 @@ def parse(kind: type[T], argv: list[str] | None, prog: str, default: T | None = 
         raise UsageError(_one_line(printed.getvalue())) from None
 
 
+def value_of(argv: list[str], flag: str) -> str | None:
+    """The value given to a flag, as `--flag value` or `--flag=value`; the last one counts."""
+    value = None
+    for word, following in zip(argv, [*argv[1:], None], strict=True):
+        if word == flag and following is not None and not following.startswith("--"):
+            value = following
+        elif word.startswith(flag + "="):
+            value = word.split("=", 1)[1]
+    return value
+
+
 def _one_line(text: str) -> str:
     """What tyro prints in a box, without the box and without what repeats."""
     words = "".join(" " if c in "╭╮╰╯│─━┃\n" else c for c in text).split()
@@ -48,5 +59,9 @@ def _one_line(text: str) -> str:
     if wrong:
         value = (wrong[2] or wrong[3]).replace("', '", " ")
         return f"{wrong[1]} cannot be {value!r}; --help tells what it takes"
-    line = line.removeprefix("Parsing error ").removeprefix("Unrecognized options ")
+    line = (
+        line.removeprefix("Invalid choice ")
+        .removeprefix("Parsing error ")
+        .removeprefix("Unrecognized options ")
+    )
     return line.split(" For full helptext")[0][:300] + "; --help lists every setting"

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from goalgan_bt import envs
-from goalgan_bt.command_line import UsageError, parse
+from goalgan_bt.command_line import UsageError, parse, value_of
 from goalgan_bt.methods import METHODS
-from goalgan_bt.record import write_atomically
+from goalgan_bt.record import write_settings
 from goalgan_bt.settings import (
     BacktrackingConfig,
     CoverageConfig,
@@ -276,11 +276,11 @@ def from_command_line(argv: list[str] | None = None) -> Config:
     """
     argv = sys.argv[1:] if argv is None else argv
     default = ANT
-    if (run := _value_of(argv, "--resume")) is not None:
+    if (run := value_of(argv, "--resume")) is not None:
         default = load(Path(run))
-    elif (env := _value_of(argv, "--env")) is not None:
+    elif (env := value_of(argv, "--env")) is not None:
         default = preset(env)
-    if run is None and (method := _value_of(argv, "--method")) is not None:
+    if run is None and (method := value_of(argv, "--method")) is not None:
         default = with_method(default, method)
     cfg = parse(Config, argv, "python -m goalgan_bt.train", default)
     check(cfg)
@@ -294,8 +294,7 @@ def from_command_line(argv: list[str] | None = None) -> Config:
 
 def save(cfg: Config, folder: Path) -> None:
     """Write the settings to `config.json` in a run folder."""
-    text = json.dumps(asdict(cfg), indent=2, default=str) + "\n"
-    write_atomically(folder / "config.json", lambda file: file.write(text.encode()))
+    write_settings(folder, asdict(cfg))
 
 
 def load(folder: Path) -> Config:
@@ -333,14 +332,3 @@ def _convert(hint: Any, value: Any) -> Any:
     ):
         return Path(value)
     return tuple(value) if isinstance(value, list) else value
-
-
-def _value_of(argv: list[str], flag: str) -> str | None:
-    """The value given to a flag, as `--flag value` or `--flag=value`; the last one counts."""
-    value = None
-    for word, following in zip(argv, [*argv[1:], None], strict=True):
-        if word == flag and following is not None and not following.startswith("--"):
-            value = following
-        elif word.startswith(flag + "="):
-            value = word.split("=", 1)[1]
-    return value

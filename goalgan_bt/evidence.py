@@ -7,8 +7,8 @@ and method (environments are never mixed, so that is their stratified bootstrap)
 
 import io
 import math
-import shlex
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import asdict
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,18 +16,16 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
-from goalgan_bt import config, record
+from goalgan_bt import record
 from goalgan_bt.command_line import UsageError
 from goalgan_bt.envs.maze import FloatArray
+from goalgan_bt.study import Run, Study, Tables, settings
 from goalgan_bt.viz.published import published
-
-if TYPE_CHECKING:
-    from goalgan_bt.study import Study, Tables
 
 THRESHOLDS = (0.3, 0.48, 0.63, 0.9)  # coverage; 0.48 and 0.63 are Goyal et al. 2019's
 # Whom times are compared with: all methods with the first of these, those with traces with the
 # others; where a study has none of them, all with its own first method.
-REFERENCES = ("goal_gan", "self_imitation", "hindsight")
+REFERENCES = ("goal_gan", "actor_critic", "per", "self_imitation", "hindsight")
 RESAMPLES = 5000
 
 TIMES = """\
@@ -124,7 +122,7 @@ def ratio(ours: list[Curve], theirs: list[Curve], threshold: float) -> Ratio:
     return Ratio(Interval(*np.exp([mean, mean - half, mean + half])), (a, b), n)
 
 
-def curves(tables: "Tables") -> dict[tuple[str, str], dict[int, Curve]]:
+def curves(tables: Tables) -> dict[tuple[str, str], dict[int, Curve]]:
     """The runs by environment and method, then by seed."""
     points: dict[tuple[str, str, int], list[tuple[float, float]]] = {}
     for row in tables.curves:
@@ -136,7 +134,7 @@ def curves(tables: "Tables") -> dict[tuple[str, str], dict[int, Curve]]:
     return runs
 
 
-def report(study: "Study", tables: "Tables") -> None:
+def report(study: Study, tables: Tables) -> None:
     """Write README.md, summary.csv and curves.png beside the tables of a study."""
     runs = curves(tables)
     rows: list[dict[str, str]] = []
@@ -169,7 +167,7 @@ def report(study: "Study", tables: "Tables") -> None:
     )
 
 
-def _row(env: str, method: str, seeds: dict[int, Curve], tables: "Tables") -> dict[str, str]:
+def _row(env: str, method: str, seeds: dict[int, Curve], tables: Tables) -> dict[str, str]:
     of = list(seeds.values())
     costs = [row for row in tables.costs if (row["env"], row["method"]) == (env, method)]
     row = {
@@ -250,8 +248,7 @@ def _curves(ax: Axes, env: str, of: dict[str, dict[int, Curve]]) -> None:
         style = _style(i)
         ax.plot(grid / 1e6, bounds[:, 0], label=f"{method} ({len(seeds)})", **style)
         ax.fill_between(grid / 1e6, *bounds[:, 1:].T, color=style["color"], alpha=0.12, lw=0)
-    cfg = config.from_command_line(["--env", *shlex.split(env)])
-    lines = published({"env": cfg.env, "dim": cfg.dim})
+    lines = published(asdict(settings(Run(env, "", 0, ""))))
     for line, (x, side) in zip(lines, ((0, "left"), (1, "right")), strict=False):
         steps, level = line.last
         name = f"{line.method}, published, {steps / 1e6:.0f}M steps"

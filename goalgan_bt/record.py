@@ -80,6 +80,12 @@ def write_meta(folder: Path, maze: Maze | None) -> None:
     (folder / "meta.json").write_text(json.dumps(meta, indent=2) + "\n")
 
 
+def write_settings(folder: Path, settings: dict[str, Any]) -> None:
+    """Write the resolved settings to `config.json`."""
+    text = json.dumps(settings, indent=2, default=str) + "\n"
+    write_atomically(folder / "config.json", lambda file: file.write(text.encode()))
+
+
 class Record:
     """Writes metrics and frames into a run folder.
 

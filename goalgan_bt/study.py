@@ -30,7 +30,7 @@ from typing import Any, Literal, NamedTuple
 
 import tyro
 
-from goalgan_bt import config, record
+from goalgan_bt import config, four_rooms, record
 from goalgan_bt.command_line import UsageError, parse
 from goalgan_bt.progress import complain, say
 
@@ -126,7 +126,7 @@ def load(name: str) -> Study:
             flags = shlex.split(f"{run.env} {run.flags}")
             if given := {word.split("=")[0] for word in flags} & OURS:
                 raise UsageError(f"{given.pop()} is the study's own")
-            config.from_command_line(words(run))
+            settings(run)
         except ValueError as error:  # UsageError is one
             raise UsageError(f"{wrong}{run.env}, {run.method}: {error}") from None
     return study
@@ -144,8 +144,20 @@ def grid(study: Study) -> list[Run]:
 
 def words(run: Run) -> list[str]:
     """The flags of `goalgan_bt.train` for a run."""
-    common = ["--seed", str(run.seed), "--threads", "1", "--viz", "none"]
-    return ["--env", *shlex.split(run.env), *common, *shlex.split(run.flags)]
+    alone = [] if four_rooms.asked_for(["--env", run.env]) else ["--threads", "1", "--viz", "none"]
+    flags = shlex.split(run.flags)
+    return ["--env", *shlex.split(run.env), "--seed", str(run.seed), *alone, *flags]
+
+
+def settings(run: Run) -> Any:
+    """The settings that its flags make.
+
+    Raises:
+        UsageError: for bad ones.
+    """
+    asked = words(run)
+    kind = four_rooms if four_rooms.asked_for(asked) else config
+    return kind.from_command_line(asked)
 
 
 def perform(run: Run, folder: Path) -> Path:
@@ -164,7 +176,7 @@ def perform(run: Run, folder: Path) -> Path:
     flags = [*words(run), "--out", str(folder)]
     if begun := sorted(folder.glob("*/checkpoint.pt")):
         place = begun[-1].parent
-        asked = config.from_command_line(words(run))
+        asked = settings(run)
         if replace(config.load(place), out=asked.out, resume=None) != asked:
             raise record.RunError(f"{place} was begun with other settings: remove it")
         ended = place / record.ENDED
@@ -183,7 +195,7 @@ def perform(run: Run, folder: Path) -> Path:
     if done.returncode != 0 and not finished:
         last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
         raise record.RunError(f"{run.env}, {run.method}, seed {run.seed} failed: {last}")
-    return sorted(folder.glob("*/checkpoint.pt"))[-1].parent
+    return max(folder.glob("*/config.json"), key=os.path.getmtime).parent
 
 
 class Tables:

@@ -18,6 +18,10 @@ if __name__ == "__main__":
 
     signal.signal(signal.SIGINT, _leave)
     signal.signal(signal.SIGTERM, _leave)
+    from goalgan_bt import four_rooms
+
+    if four_rooms.asked_for(sys.argv):  # another learner, which needs none of what follows
+        sys.exit(four_rooms.main())
     if {"-h", "--help"} & set(sys.argv):
         from goalgan_bt import command_line, config
 
@@ -37,7 +41,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from goalgan_bt import checkpoint, config, envs, ranks, record, trpo
+from goalgan_bt import checkpoint, config, envs, four_rooms, ranks, record, trpo
 from goalgan_bt.advantage import gae
 from goalgan_bt.backtracking import RecallTraces, Steps, consistency, recall_traces
 from goalgan_bt.beside import Beside, group
@@ -475,7 +479,7 @@ def how_to_go_on(folder: Path | None) -> str:
 
 def script() -> None:
     """Entry point of the `goalgan-bt` command."""
-    sys.exit(main())
+    sys.exit(four_rooms.main() if four_rooms.asked_for(sys.argv) else main())
 
 
 if __name__ == "__main__":

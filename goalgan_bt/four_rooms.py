@@ -1,0 +1,476 @@
+"""Recall traces with the true backward model: four rooms (Goyal et al. 2019, sections 5.1, 5.2).
+
+    python -m goalgan_bt.train --env four_rooms_15 --method recall_traces
+
+A tabular actor-critic with generalised advantages, the same with prioritised experience replay,
+and the same with recall traces: the backward state model q(s_t | a_t, s_{t+1}) is exact, the
+backward action model q(a_t | s_{t+1}) learned from the best trajectories, or uniform.
+"""
+
+import errno
+import re
+import sys
+import time
+from dataclasses import asdict, dataclass, field, replace
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from goalgan_bt import record
+from goalgan_bt.advantage import gae
+from goalgan_bt.command_line import UsageError, parse, value_of
+from goalgan_bt.envs.four_rooms import SIZES, FourRooms, Ints
+from goalgan_bt.envs.maze import BoolArray, FloatArray
+from goalgan_bt.progress import complain, say
+
+NAME = re.compile(r"four_rooms_(\d{1,2})")
+FAINT = 0.01  # times that each possible action counts as seen, so that none is impossible
+FLOOR = 1e-4  # of a priority, so that nothing is never replayed
+REPORTS = 60  # per run
+EPISODES = 50  # with which a policy is measured
+
+
+@dataclass(frozen=True)
+class ReplayConfig:
+    """Prioritised experience replay (Schaul et al. 2016). Its default depends on the size: the
+    paper's table."""
+
+    batch: int = 1000
+    """Transitions per replay update."""
+    every: int = 3
+    """Actor-critic updates per replay update."""
+    alpha: float = 0.95
+    """Priorities are raised to this power."""
+    beta: float = 0.1
+    """Importance weights are raised to this power."""
+    capacity: int = 100_000
+    """Transitions that are kept, the newest."""
+    rate: float = 0.5
+    """Step size of the policy."""
+
+
+@dataclass(frozen=True)
+class TracesConfig:
+    """Recall traces and their imitation."""
+
+    length: int = 20
+    """Steps of a recall trace."""
+    number: int = 16
+    """Recall traces per update."""
+    every: int = 1
+    """Actor-critic updates per turn of recall traces."""
+    updates: int = 1
+    """Updates from recall traces per turn."""
+    trajectories: int = 100
+    """Best trajectories from which the backward action model learns (the paper's k_traj)."""
+    rate: float = 0.1
+    """Step size of the imitation."""
+
+
+@dataclass(frozen=True)
+class FourRoomsConfig:
+    """Learn to find the goal in four rooms from sparse reward: 1 on reaching it, else 0."""
+
+    env: str = "four_rooms_15"
+    """four_rooms_N, N cells a side."""
+    method: Literal["actor_critic", "per", "recall_traces", "random_model"] = "recall_traces"
+    """Actor-critic; with prioritised replay; with recall traces; with traces of random actions."""
+    seed: int = 0
+    """Seed of everything random."""
+    total_steps: int = 300_000
+    """Environment steps of training."""
+    out: Path = Path("runs")
+    """Folder of runs; this run gets a folder of its own in it."""
+    num_envs: int = 16
+    """Simulations side by side."""
+    steps: int = 20
+    """Steps of each simulation per update."""
+    horizon: int = 200
+    """Steps of an episode."""
+    discount: float = 0.98
+    """Discount factor."""
+    gae_lambda: float = 0.95
+    """Lambda of generalised advantage estimation."""
+    policy_rate: float = 1.0
+    """Step size of the policy's logits, per step of the batch."""
+    value_rate: float = 0.2
+    """Step size of the values, towards the mean return of a state in the batch."""
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    traces: TracesConfig = field(default_factory=TracesConfig)
+
+    @property
+    def size(self) -> int:
+        """Cells of a side."""
+        named = NAME.fullmatch(self.env)
+        if named is None or int(named[1]) not in SIZES:
+            raise UsageError(
+                f"unknown environment {self.env!r}: four_rooms_{SIZES[0]} to _{SIZES[-1]}, say"
+            )
+        return int(named[1])
+
+
+class ActorCritic:
+    """A policy and a value for each state, as tables.
+
+    Attributes:
+        logits: (S, A); values: (S,).
+    """
+
+    def __init__(self, states: int, actions: int) -> None:
+        self.logits, self.values = np.zeros((states, actions)), np.zeros(states)
+
+    def probabilities(self) -> FloatArray:
+        """pi(a | s), (S, A)."""
+        weights = np.exp(self.logits - self.logits.max(axis=1, keepdims=True))
+        return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+    def reinforce(self, states: Ints, actions: Ints, weights: FloatArray, rate: float) -> None:
+        """Ascend sum_i weights_i log pi(a_i | s_i): the policy gradient with advantages for
+        weights, imitation with ones. All (n,)."""
+        gradient = np.zeros_like(self.logits)
+        np.add.at(gradient, (states, actions), weights)
+        of_state = np.bincount(states, weights, len(gradient))
+        self.logits += rate * (gradient - of_state[:, None] * self.probabilities())
+        self.logits -= self.logits.mean(axis=1, keepdims=True)
+
+    def evaluate(self, states: Ints, errors: FloatArray, rate: float) -> None:
+        """Move values by the mean of their errors, both (n,)."""
+        n = np.bincount(states, minlength=len(self.values))
+        self.values += rate * np.bincount(states, errors, len(self.values)) / np.maximum(n, 1)
+
+
+class Trajectory(NamedTuple):
+    """states (T + 1,), actions (T,), and whether the goal was reached."""
+
+    states: Ints
+    actions: Ints
+    success: bool
+
+
+class Prioritised:
+    """A ring of steps (s, a, discounted return), replayed by what they promise.
+
+    As self-imitation learning has it for actor-critics (Oh et al. 2018): the priority is how much
+    better a step turned out than the critic says, max(0, R - V(s)).
+    """
+
+    def __init__(self, cfg: ReplayConfig) -> None:
+        self.cfg = cfg
+        self._states, self._actions = np.zeros((2, cfg.capacity), dtype=np.int64)
+        self._returns = np.zeros(cfg.capacity)
+        self.added = 0
+
+    def add(self, trajectory: Trajectory, discount: float) -> None:
+        """Remember a finished episode."""
+        n = len(trajectory.actions)
+        rows = (self.added + np.arange(n)) % len(self._returns)
+        self._states[rows], self._actions[rows] = trajectory.states[:-1], trajectory.actions
+        self._returns[rows] = discount ** np.arange(n - 1, -1, -1) * trajectory.success
+        self.added += n
+
+    def teach(self, learner: ActorCritic, value_rate: float, rng: np.random.Generator) -> None:
+        """One update of policy and values from replayed steps."""
+        size = min(self.added, len(self._returns))
+        if size == 0:
+            return
+        better = np.maximum(self._returns[:size] - learner.values[self._states[:size]], 0)
+        priority = (better + FLOOR) ** self.cfg.alpha
+        chance = priority / priority.sum()
+        rows = rng.choice(size, self.cfg.batch, p=chance)
+        weights = (size * chance[rows]) ** -self.cfg.beta
+        promise = better[rows] * weights / weights.max()
+        learner.reinforce(self._states[rows], self._actions[rows], promise, self.cfg.rate)
+        learner.evaluate(self._states[rows], promise, value_rate)
+
+
+class Recall:
+    """The best trajectories so far, the backward action model that they make, and its traces.
+
+    Args:
+        rooms: the world, whose backward transitions are known.
+        cfg: settings.
+        learned: whether q(a | s') is learned, or uniform over what can have led to s'.
+    """
+
+    def __init__(self, rooms: FourRooms, cfg: TracesConfig, learned: bool) -> None:
+        self._rooms, self.cfg, self._learned = rooms, cfg, learned
+        self.best: list[Trajectory] = []  # the shortest first, which have the highest return
+
+    def add(self, trajectory: Trajectory) -> None:
+        """Keep an episode that reached the goal, if it is among the best."""
+        if trajectory.success:
+            self.best.append(trajectory)
+            self.best.sort(key=lambda known: len(known.actions))
+            del self.best[self.cfg.trajectories :]
+
+    def action_model(self) -> FloatArray:
+        """q(a | s'), (S, A): how often each action led to s' in the best trajectories, which is
+        its maximum likelihood; 0 for what cannot have led there."""
+        times = np.full(self._rooms.ways.shape, FAINT)
+        if self._learned:
+            for states, actions, _ in self.best:
+                np.add.at(times, (states[1:], actions), 1.0)
+        times = times * (self._rooms.ways > 0)
+        return np.asarray(times / times.sum(axis=1, keepdims=True))
+
+    def seed(self, values: FloatArray, discount: float) -> int:
+        """Of the states that the best trajectories reached, the one that was worth most to reach
+        (Algorithm 2): its reward and what the critic says of it."""
+        reached = np.unique(np.concatenate([known.states[1:] for known in self.best]))
+        worth = np.where(reached == self._rooms.goal, 1.0, discount * values[reached])
+        return int(reached[worth.argmax()])
+
+    def traces(self, seed: int, rng: np.random.Generator) -> tuple[Ints, Ints]:
+        """Recall traces from a state, the step nearest to it first: states and actions, both
+        (length, number)."""
+        model, rooms = self.action_model(), self._rooms
+        states, actions = np.zeros((2, self.cfg.length, self.cfg.number), dtype=np.int64)
+        following = np.full(self.cfg.number, seed)
+        for t in range(self.cfg.length):
+            actions[t] = pick(model[following], rng)
+            way = rng.random(self.cfg.number) * rooms.ways[following, actions[t]]
+            states[t] = rooms.predecessors[following, actions[t], way.astype(np.int64)]
+            following = states[t]
+        return states, actions
+
+    def teach(self, learner: ActorCritic, discount: float, rng: np.random.Generator) -> None:
+        """Let the policy imitate recall traces, once there is a trajectory to learn from."""
+        for _ in range(self.cfg.updates if self.best else 0):
+            states, actions = self.traces(self.seed(learner.values, discount), rng)
+            ones = np.ones(states.size)
+            learner.reinforce(states.ravel(), actions.ravel(), ones, self.cfg.rate)
+
+
+class Batch(NamedTuple):
+    """T steps of N simulations, all (T, N); `ended` holds the finished episodes."""
+
+    states: Ints
+    actions: Ints
+    next_states: Ints
+    terminated: BoolArray
+    truncated: BoolArray
+    ended: list[Trajectory]
+
+
+class Walkers:
+    """N simulations side by side, which go on from one batch to the next.
+
+    Args:
+        rooms: the world.
+        n: N.
+        horizon: steps of an episode.
+    """
+
+    def __init__(self, rooms: FourRooms, n: int, horizon: int) -> None:
+        self._rooms, self._horizon, self._all = rooms, horizon, np.arange(n)
+        self._age = np.zeros(n, dtype=np.int64)
+        self._states = np.full((n, horizon + 1), rooms.start)
+        self._actions = np.zeros((n, horizon), dtype=np.int64)
+
+    def walk(self, policy: FloatArray, steps: int, rng: np.random.Generator) -> Batch:
+        """Take some steps with pi(a | s), (S, A)."""
+        rooms, n = self._rooms, len(self._all)
+        states, actions, following = np.zeros((3, steps, n), dtype=np.int64)
+        terminated, truncated = np.zeros((2, steps, n), dtype=bool)
+        ended: list[Trajectory] = []
+        for t in range(steps):
+            states[t] = self._states[self._all, self._age]
+            actions[t] = pick(policy[states[t]], rng)
+            following[t] = rooms.next_state[states[t], actions[t]]
+            self._actions[self._all, self._age] = actions[t]
+            self._age += 1
+            self._states[self._all, self._age] = following[t]
+            terminated[t] = following[t] == rooms.goal
+            truncated[t] = ~terminated[t] & (self._age == self._horizon)
+            for i in np.flatnonzero(terminated[t] | truncated[t]):
+                path, acts = self._states[i, : self._age[i] + 1], self._actions[i, : self._age[i]]
+                ended.append(Trajectory(path.copy(), acts.copy(), bool(terminated[t, i])))
+                self._age[i], self._states[i, 0] = 0, rooms.start
+        return Batch(states, actions, following, terminated, truncated, ended)
+
+
+def pick(chances: FloatArray, rng: np.random.Generator) -> Ints:
+    """A column for each row of probabilities, (n, A) -> (n,)."""
+    drawn = rng.random(len(chances))[:, None] * chances.sum(axis=1, keepdims=True)
+    return np.asarray((chances.cumsum(axis=1) > drawn).argmax(axis=1))
+
+
+class Measured(NamedTuple):
+    """Of the stochastic policy from the start: success, discounted return, visits (S,) of each
+    state, and the environment steps that it took."""
+
+    success: float
+    discounted: float
+    visits: Ints
+    steps: int
+
+
+def measure(
+    rooms: FourRooms, learner: ActorCritic, cfg: FourRoomsConfig, rng: np.random.Generator
+) -> Measured:
+    """Let the policy try the goal `EPISODES` times."""
+    batch = Walkers(rooms, EPISODES, cfg.horizon).walk(learner.probabilities(), cfg.horizon, rng)
+    first = np.cumsum(batch.terminated | batch.truncated, axis=0) == 0
+    first[1:], first[0] = first[:-1].copy(), True  # up to and with the step that ends an episode
+    won = (batch.terminated & first).any(axis=0)
+    lengths = first.sum(axis=0)
+    discounted = float((won * cfg.discount ** (lengths - 1)).mean())
+    visits = np.bincount(batch.states[first], minlength=len(rooms.cells))
+    return Measured(float(won.mean()), discounted, visits, batch.states.size)
+
+
+def train(cfg: FourRoomsConfig, folder: Path) -> Measured:
+    """Learn to find the goal; writes `metrics.csv` and `visits.npz` into the run folder.
+
+    Args:
+        cfg: settings.
+        folder: the run folder.
+
+    Returns:
+        What the policy is worth in the end.
+    """
+    rooms = FourRooms(cfg.size)
+    rng, test_rng = (np.random.default_rng([cfg.seed, i]) for i in range(2))
+    learner = ActorCritic(*rooms.next_state.shape)
+    walkers = Walkers(rooms, cfg.num_envs, cfg.horizon)
+    replay = Prioritised(cfg.replay)
+    recall = Recall(rooms, cfg.traces, learned=cfg.method != "random_model")
+    rows: list[dict[str, str]] = []
+    began, steps, tested, update, next_report = time.perf_counter(), 0, 0, 0, 0.0
+    visited = np.zeros(len(rooms.cells), dtype=np.int64)
+    while steps < cfg.total_steps:
+        update += 1
+        batch = walkers.walk(learner.probabilities(), cfg.steps, rng)
+        steps += batch.states.size
+        visited += np.bincount(batch.states.ravel(), minlength=len(visited))
+        known = learner.values.astype(np.float32)
+        values = known[batch.states]
+        advantages, returns = gae(
+            batch.terminated.astype(np.float32),  # the reward
+            values,
+            known[batch.next_states],
+            batch.terminated,
+            batch.truncated,
+            cfg.discount,
+            cfg.gae_lambda,
+        )
+        at = batch.states.ravel(), batch.actions.ravel()
+        learner.reinforce(*at, advantages.ravel(), cfg.policy_rate)
+        learner.evaluate(at[0], (returns - values).ravel(), cfg.value_rate)
+
+        if cfg.method == "per":
+            for trajectory in batch.ended:
+                replay.add(trajectory, cfg.discount)
+            if update % cfg.replay.every == 0:
+                replay.teach(learner, cfg.value_rate, rng)
+        elif cfg.method != "actor_critic":
+            for trajectory in batch.ended:
+                recall.add(trajectory)
+            if update % cfg.traces.every == 0:
+                recall.teach(learner, cfg.discount, rng)
+
+        if steps >= min(next_report, cfg.total_steps):
+            next_report = steps + cfg.total_steps / REPORTS
+            measured = measure(rooms, learner, cfg, test_rng)
+            tested += measured.steps
+            seconds = time.perf_counter() - began
+            row = {
+                "iteration": update,
+                "steps/train": steps,
+                "steps/label": 0,
+                "steps/eval": tested,
+                "time/total": round(seconds, 3),
+                "time/fps": round(steps / seconds),
+                "eval/coverage": measured.success,
+                "eval/return": round(measured.discounted, 6),
+                "eval/states": int((measured.visits > 0).sum()),
+                "train/states": int((visited > 0).sum()),
+            }
+            rows.append({name: str(value) for name, value in row.items()})
+            record.write_table(folder / "metrics.csv", list(row), rows)
+    grids = {"training": visited, "trained": measured.visits}
+    pictures: dict[str, Any] = {name: rooms.picture(visits) for name, visits in grids.items()}
+    record.write_atomically(folder / "visits.npz", lambda file: np.savez(file, **pictures))
+    (folder / record.ENDED).write_text("complete\n")
+    return measured
+
+
+TABLE = {  # the paper's settings of prioritised replay by size: batch, every, alpha, beta
+    11: ReplayConfig(200, 3, 0.8, 0.1),
+    13: ReplayConfig(2000, 3, 0.8, 0.1),
+    15: ReplayConfig(1000, 3, 0.95, 0.1),
+}
+
+
+def preset(env: str) -> FourRoomsConfig:
+    """The default settings for a size; larger rooms than the paper's table has replay as in 15.
+
+    Raises:
+        UsageError: if there is no such environment.
+    """
+    cfg = FourRoomsConfig(env=env)
+    nearest = min(TABLE, key=lambda size: abs(size - cfg.size))
+    return replace(cfg, replay=TABLE[nearest])
+
+
+def asked_for(argv: list[str]) -> bool:
+    """Whether a command line names one of these environments."""
+    return NAME.fullmatch(value_of(argv, "--env") or "") is not None
+
+
+COUNTS = (
+    "total_steps num_envs steps horizon replay.batch replay.every replay.capacity traces.length "
+    "traces.number traces.every traces.trajectories"
+)
+RATES = (
+    "seed policy_rate value_rate replay.rate replay.alpha replay.beta traces.rate traces.updates"
+)
+
+
+def from_command_line(argv: list[str]) -> FourRoomsConfig:
+    """The settings that a command line asks for.
+
+    Raises:
+        UsageError: for an unknown flag, a value of the wrong kind, or one that makes no sense.
+        SystemExit: after `--help`.
+    """
+    default = preset(value_of(argv, "--env") or FourRoomsConfig.env)
+    cfg = parse(FourRoomsConfig, argv, "python -m goalgan_bt.train", default)
+    for names, low, high in (
+        (COUNTS, 1, 10**9),
+        (RATES, 0, 10**9),
+        ("discount gae_lambda", 0, 1),
+    ):
+        for name in names.split():
+            value = attrgetter(name)(cfg)
+            if not low <= value <= high:
+                flag = "--" + name.replace("_", "-")
+                raise UsageError(f"{flag} must be between {low} and {high}, not {value}")
+    return cfg
+
+
+def main() -> int:
+    """The command line; returns the exit code."""
+    folder = None
+    try:
+        cfg = from_command_line(sys.argv[1:])
+        folder = record.create_folder(cfg.out, cfg.env, cfg.seed)
+        record.write_meta(folder, None)
+        record.write_settings(folder, asdict(cfg))
+        say(f"run folder: {folder}")
+        measured = train(cfg, folder)
+        seen = int((measured.visits > 0).sum())
+        say(
+            f"coverage {measured.success:.3f} after {cfg.total_steps:,} training steps, return "
+            f"{measured.discounted:.3f}, {seen} cells visited: {folder}"
+        )
+    except KeyboardInterrupt:
+        complain(f"interrupted: {folder or 'nothing'} holds what was measured; start again")
+        return 130
+    except (UsageError, record.RunError, OSError) as error:
+        full = isinstance(error, OSError) and error.errno == errno.ENOSPC
+        complain("the disk is full: free some space" if full else str(error))
+        return 2
+    return 0
