@@ -71,7 +71,8 @@ class StudyConfig:
     """Run a study, or what is missing of it, and write its tables, report and picture."""
 
     study: tyro.conf.Positional[str]
-    """A TOML file, or one of those that come along: point_umaze, ant_umaze, point_nd, ablations."""
+    """A TOML file, or one of those that come along: point_umaze, ant_umaze,
+    point_nd, ablations, four_rooms, four_rooms_ablations."""
     out: Path = Path("docs/studies")
     """Where tables and report go, in a folder with the study's name."""
     runs: Path = Path("runs/studies")

@@ -210,7 +210,7 @@ def test_unknown_and_unfinished_studies_end_in_one_line(tmp_path):
         assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize("name", ["point_umaze", "ant_umaze", "point_nd", "ablations"])
+@pytest.mark.parametrize("name", [path.stem for path in study.SHIPPED.glob("*.toml")])
 def test_the_studies_that_come_along_can_be_run(name):
     spec = study.load(name)
     assert len(study.grid(spec)) == len(spec.seeds) * len(spec.methods) * len(spec.envs)
