@@ -8,7 +8,7 @@ body's physical state (positions and velocities), without the goal: physics does
 """
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -153,6 +153,8 @@ class Scale(nn.Module):
 
     def set(self, data: Tensor) -> None:
         """Statistics of data (n, dim), the standard deviation at least 1e-3."""
+        if data.shape[1] == 0:  # goals, where there are none
+            return
         std, self.mean = torch.std_mean(data, dim=0)
         self.std = std.clamp(min=1e-3)
 
@@ -293,6 +295,14 @@ class BacktrackingModel(nn.Module):
         delta = sample_gaussian(self.state_net, torch.cat([s, a], dim=-1), self._rng)
         return next_states + self.delta_scale.restore(delta), actions
 
+    @torch.no_grad()
+    def action_log_density(self, next_states: Tensor, actions: Tensor) -> Tensor:
+        """log q(a | s') of a model that is not told goals, (n, state_dim), (n, act_dim) -> (n,)."""
+        mean = self.action_net(self.state_scale.normalise(next_states))
+        miss = mean - self.action_scale.normalise(actions)
+        per_dim = 0.5 * miss.square() + CONSTANT + self.action_scale.std.log()
+        return -per_dim.sum(dim=-1)
+
     def _told(self, s: Tensor, goals: Tensor) -> Tensor:
         """The input of q(a | s') or, where it is conditioned, of q(a | s', g)."""
         if not self.cfg.conditioned:
@@ -368,8 +378,26 @@ def _distance(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.norm(a - b, axis=-1))
 
 
+class StateSpace(Protocol):
+    """What a trace has to know of the world."""
+
+    @property
+    def state_dim(self) -> int:
+        """Size of a state."""
+
+    @property
+    def act_dim(self) -> int:
+        """Size of an action."""
+
+    def repair(self, states: FloatArray) -> FloatArray:
+        """See `GoalEnv.repair`."""
+
+    def valid(self, states: FloatArray) -> BoolArray:
+        """See `GoalEnv.valid`."""
+
+
 def recall_traces(
-    model: BacktrackingModel, env: GoalEnv, seeds: FloatArray, goals: FloatArray, length: int
+    model: BacktrackingModel, env: StateSpace, seeds: FloatArray, goals: FloatArray, length: int
 ) -> RecallTraces:
     """Unroll the model backward from states that stand on goals.
 

@@ -1,0 +1,328 @@
+"""Recall traces for any Stable-Baselines3 agent with a Gaussian policy (extra `sb3`).
+
+    from stable_baselines3 import SAC
+    from goalgan_bt.sb3 import RecallTraces
+    SAC("MlpPolicy", "Hopper-v5").learn(200_000, callback=RecallTraces())
+
+Goyal et al. 2019, Algorithm 1 with Algorithm 2: the best trajectories teach a backtracking model,
+which is unrolled from the most valuable states; the policy imitates those traces. The state is the
+observation: the environment need know nothing of us.
+"""
+
+import time
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, cast
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.sac.policies import SACPolicy
+from torch import Tensor
+from torch.distributions import Normal, kl_divergence
+
+from goalgan_bt.backtracking import BacktrackingModel, Transitions, recall_traces
+from goalgan_bt.envs.maze import BoolArray, FloatArray
+from goalgan_bt.settings import BacktrackingConfig
+
+EDGE = 0.999  # of the range of a squashed action, beyond which its inverse is taken as there
+FAR = 5.0  # standard deviations from what was seen at which a trace ends
+KL_SAMPLE = 1024  # states on which the KL of an imitation is bounded
+
+
+@dataclass(frozen=True)
+class RecallConfig:
+    """What to recall and how much of it to imitate."""
+
+    trace_length: int = 20
+    """Steps of a recall trace (paper: 20; with TRPO Hopper 10; Ant and Humanoid 50)."""
+    traces: int = 64
+    """Recall traces per turn."""
+    top_percent: float = 10.0
+    """Share of the remembered trajectories, those of highest return, that teach the model: their
+    lowest return is the threshold L of the paper's section 4, which rises as the agent learns."""
+    capacity: int = 100_000
+    """Steps that are remembered, in whole trajectories, the newest."""
+    min_steps: int = 500
+    """Steps of the best trajectories before which nothing is recalled."""
+    every: int | None = None
+    """Environment steps between two turns; by default a rollout, or 500 for an agent that has
+    none (SAC)."""
+    seeds: Literal["value", "reward"] = "value"
+    """Traces begin at states of which the critic thinks highest, or that were rewarded most (the
+    paper's proxy where there is no critic)."""
+    model_steps: int = 20
+    """Training steps of the backtracking model per turn."""
+    imitation_steps: int = 5
+    """Gradient steps of imitation per turn."""
+    imitation_batch: int = 256
+    """Steps of traces in each."""
+    learning_rate: float = 1e-4
+    """Step size of the imitation's Adam."""
+    max_kl: float = 0.005
+    """Imitation stops where the mean KL of a turn passes this, nats."""
+
+
+class Trajectory(NamedTuple):
+    """One episode: observations (T + 1, obs_dim), actions (T, act_dim) in [-1, 1], rewards (T,)."""
+
+    obs: FloatArray
+    actions: FloatArray
+    rewards: FloatArray
+
+
+class Seen:
+    """The observations of an agent as states: valid is what is not far from those seen."""
+
+    def __init__(self, obs: FloatArray, act_dim: int) -> None:
+        self.state_dim, self.act_dim = obs.shape[1], act_dim
+        self._mean, self._std = obs.mean(axis=0), obs.std(axis=0) + 1e-3
+
+    def repair(self, states: FloatArray) -> FloatArray:
+        """Nothing is known of what makes an observation right."""
+        return states
+
+    def valid(self, states: FloatArray) -> BoolArray:
+        """Whether each state (n, state_dim) is finite and not far away, (n,)."""
+        return np.asarray((np.abs(states - self._mean) < FAR * self._std).all(axis=1))
+
+
+class RecallTraces(BaseCallback):
+    """Lets an agent imitate recall traces while it learns. It may be given to `learn` again, and
+    saved and loaded beside the agent.
+
+    Args:
+        cfg: settings.
+        seed: of the model and the traces.
+        verbose: as of every callback.
+
+    Raises (when learning begins):
+        TypeError: if the agent's policy is no Gaussian (without state-dependent exploration), or
+            its observations or actions are not vectors.
+    """
+
+    def __init__(self, cfg: RecallConfig | None = None, seed: int = 0, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        self.cfg = cfg or RecallConfig()
+        self.trajectories: deque[Trajectory] = deque()
+        self.backtracking: BacktrackingModel | None = None
+        self._rng, self._noise = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
+        self._remembered, self._spent, self._last = 0, 0.0, 0
+        self._saved: dict[str, Any] | None = None
+
+    def _init_callback(self) -> None:
+        policy: Any = self.model.policy
+        space, actions = self.model.observation_space, self.model.action_space
+        if not isinstance(policy, (ActorCriticPolicy, SACPolicy)) or self.model.use_sde:
+            raise TypeError(
+                "RecallTraces needs an agent with a Gaussian policy and without state-dependent "
+                "exploration, such as SAC, TRPO, PPO or A2C"
+            )
+        if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
+            raise TypeError(f"RecallTraces needs observations that are vectors, not {space}")
+        if not (isinstance(actions, spaces.Box) and len(actions.shape) == 1):
+            raise TypeError(f"RecallTraces needs actions that are vectors of numbers: {actions}")
+        self._squashed = isinstance(policy, SACPolicy)
+        self._learner: Any = self.model.policy
+        if self._squashed:
+            self._learner = policy.actor
+        self._low, self._high = actions.low.astype(float), actions.high.astype(float)
+        obs_dim, act_dim = space.shape[0], actions.shape[0]
+        if self.backtracking is None:
+            model_cfg = BacktrackingConfig(batch=256, steps=self.cfg.model_steps)
+            self.backtracking = BacktrackingModel(obs_dim, act_dim, 0, model_cfg, self._noise)
+        self._optimiser = torch.optim.Adam(self._learner.parameters(), self.cfg.learning_rate)
+        if self._saved is not None:
+            self.backtracking.load_state_dict(self._saved["model"])
+            self._optimiser.load_state_dict(self._saved["optimiser"])
+            self._saved = None
+        self._paths: list[list[tuple[Any, Any, float]]] = [[] for _ in range(self.model.n_envs)]
+        self._last = self.num_timesteps
+
+    def _on_step(self) -> bool:
+        given = self.locals
+        actions = given.get("clipped_actions", given["actions"])
+        told = 2 * (actions - self._low) / (self._high - self._low) - 1
+        normalising = self.model.get_vec_normalize_env()
+        rewards = given["rewards"] if normalising is None else normalising.get_original_reward()
+        last_obs: Any = self.model._last_obs
+        for i, path in enumerate(self._paths):
+            path.append((last_obs[i].copy(), told[i], float(rewards[i])))
+            if given["dones"][i]:
+                self._remember(path, given["infos"][i]["terminal_observation"])
+                path.clear()
+        return True
+
+    def _remember(self, path: list[tuple[Any, Any, float]], last_obs: FloatArray) -> None:
+        obs, actions, rewards = zip(*path, strict=True)
+        ended = Trajectory(np.array([*obs, last_obs]), np.array(actions), np.array(rewards))
+        self.trajectories.append(ended)
+        self._remembered += len(path)
+        while self._remembered - len(self.trajectories[0].rewards) >= self.cfg.capacity:
+            self._remembered -= len(self.trajectories.popleft().rewards)
+
+    def _on_rollout_start(self) -> None:
+        # The agent has just learned, and what it collects next is collected by the policy as it
+        # will be then: the moment to change it. SAC has such a moment every few steps.
+        every = self.cfg.every or (500 if self._squashed else 1)
+        if self.num_timesteps - self._last >= every:
+            self._last = self.num_timesteps
+            begin = time.perf_counter()
+            for name, value in self.turn().items():
+                self.logger.record(f"recall/{name}", value)
+            self._spent += time.perf_counter() - begin
+            self.logger.record("recall/seconds", self._spent)
+
+    def best(self) -> tuple[list[Trajectory], float]:
+        """The trajectories whose return is in the top percent, and the lowest of those returns."""
+        returns = np.array([trajectory.rewards.sum() for trajectory in self.trajectories])
+        if not len(returns):
+            return [], np.nan
+        most = max(1, round(len(returns) * self.cfg.top_percent / 100))
+        threshold = np.sort(returns)[-most]
+        chosen = zip(self.trajectories, returns, strict=True)
+        return [one for one, total in chosen if total >= threshold], float(threshold)
+
+    def turn(self) -> dict[str, float]:
+        """One turn of Algorithm 1 besides the agent's own: train the model, recall, imitate.
+
+        Returns:
+            threshold: L; action_nll, state_nll: see `BacktrackingModel`; valid: share of the steps
+            of the traces before they ended; loss: -log pi of the traces, nats; kl; lower_bound:
+            see `_imitate`. Nothing while there is too little to learn from.
+        """
+        chosen, threshold = self.best()
+        total = sum(len(one.rewards) for one in chosen)
+        if total < self.cfg.min_steps:
+            return {}
+        assert self.backtracking is not None
+        states, following = (
+            np.concatenate([one.obs[rows] for one in chosen])
+            for rows in (slice(-1), slice(1, None))
+        )
+        actions = np.concatenate([one.actions for one in chosen])
+        rewards = np.concatenate([one.rewards for one in chosen])
+        space = Seen(states, actions.shape[1])
+        data_cfg = BacktrackingConfig(buffer=total, min_transitions=1)
+        data = Transitions(space.state_dim, space.act_dim, 0, data_cfg)
+        data.add(states, actions, following, np.empty((total, 0)), np.zeros(total))
+        self.backtracking.seen = 0  # none of it is held out: it may have been there before
+        metrics = {"threshold": threshold, **self.backtracking.fit(data)}
+
+        worth = self._values(following) if self.cfg.seeds == "value" else rewards
+        seeds = following[np.argsort(worth)[-self.cfg.traces :]].astype(float)
+        nowhere = np.empty((len(seeds), 0))
+        traces = recall_traces(self.backtracking, space, seeds, nowhere, self.cfg.trace_length)
+        metrics["valid"] = float(traces.valid.mean())
+        if traces.valid.any():
+            after = np.concatenate([seeds[None], traces.states[:-1]])[traces.valid]
+            recalled = traces.states[traces.valid], traces.actions[traces.valid], after
+            metrics |= self._imitate(*recalled, len(seeds), states)
+        return metrics
+
+    def _gaussian(self, obs: Tensor) -> Normal:
+        """The policy before it is squashed or clipped."""
+        if self._squashed:
+            mean, log_std, _ = self._learner.get_action_dist_params(obs)
+            return Normal(mean, log_std.exp())
+        found = self._learner.get_distribution(obs).distribution
+        assert isinstance(found, Normal)
+        return found
+
+    def _tensor(self, array: FloatArray) -> Tensor:
+        return torch.as_tensor(array, dtype=torch.float32, device=self.model.device)
+
+    @torch.no_grad()
+    def _values(self, obs: FloatArray) -> FloatArray:
+        """What the critic says of observations (n, obs_dim), (n,)."""
+        told, policy = self._tensor(obs), cast(Any, self.model.policy)
+        if self._squashed:
+            judged = policy.critic(told, policy.actor(told, deterministic=True))
+            return torch.cat(judged, dim=1).amin(dim=1).cpu().numpy()
+        return policy.predict_values(told)[:, 0].cpu().numpy()
+
+    def _imitate(
+        self,
+        states: FloatArray,
+        actions: FloatArray,
+        following: FloatArray,
+        traces: int,
+        seen: FloatArray,
+    ) -> dict[str, float]:
+        """Maximise log pi(a | s) of recalled steps, in the mean of the policy only.
+
+        Args:
+            states, actions, following: (n, obs_dim), (n, act_dim) in [-1, 1], (n, obs_dim).
+            traces: how many they are of.
+            seen: (m, obs_dim) states on which the KL is bounded.
+
+        Returns:
+            loss and kl; lower_bound: of log p(R > L) (section 4), sum over a trace of
+            log pi(a | s) - log q(a | s'), nats: the world's own transitions are left out, as if
+            q(s | a, s') were exact.
+        """
+        obs, goals = self._tensor(states), self._tensor(actions)
+        if self._squashed:
+            goals = torch.atanh(goals.clamp(-EDGE, EDGE))
+            slope = -torch.log1p(-torch.tanh(goals).square())  # of atanh
+        else:
+            half = self._tensor((self._high - self._low) / 2)
+            goals = self._tensor(self._low) + half * (goals + 1)
+            slope = half.log().expand_as(goals)
+        rows = self._rng.permutation(len(seen))[:KL_SAMPLE]
+        reference = self._tensor(seen[rows])
+        with torch.no_grad():
+            old, before = self._gaussian(reference), self._gaussian(obs)
+            log_pi = (before.log_prob(goals) + slope).sum()
+        assert self.backtracking is not None
+        log_q = self.backtracking.action_log_density(
+            torch.as_tensor(following).float(), torch.as_tensor(actions).float()
+        ).sum()
+        loss, kl, params = np.nan, 0.0, list(self._learner.parameters())
+        for step in range(self.cfg.imitation_steps):
+            some = torch.from_numpy(self._rng.integers(len(obs), size=self.cfg.imitation_batch))
+            found = self._gaussian(obs[some])
+            std = found.stddev.detach()
+            miss = -Normal(found.mean, std).log_prob(goals[some]).sum(dim=1).mean()
+            if step == 0:
+                loss = miss.item()
+            known = [param.detach().clone() for param in params]
+            self._optimiser.zero_grad()
+            miss.backward()
+            self._optimiser.step()
+            with torch.no_grad():
+                new_kl = kl_divergence(old, self._gaussian(reference)).sum(dim=1).mean().item()
+                if not new_kl <= self.cfg.max_kl:
+                    for param, value in zip(params, known, strict=True):
+                        param.copy_(value)
+                    break
+            kl = new_kl
+        bound = (log_pi.cpu() - log_q).item() / traces
+        return {"loss": loss, "kl": kl, "lower_bound": bound}
+
+    def save(self, path: Path | str) -> None:
+        """Write model and trajectories, to go on with a saved agent (`load`)."""
+        if self.backtracking is None:
+            raise ValueError("nothing was learned yet: save after `learn`")
+        state = {
+            "model": self.backtracking.state_dict(),
+            "optimiser": self._optimiser.state_dict(),
+            "trajectories": [[torch.from_numpy(x) for x in one] for one in self.trajectories],
+        }
+        torch.save(state, path)
+
+    @classmethod
+    def load(
+        cls, path: Path | str, cfg: RecallConfig | None = None, seed: int = 0
+    ) -> "RecallTraces":
+        """What `save` wrote, to be given to `learn` of the loaded agent."""
+        state = torch.load(path, weights_only=True)
+        callback = cls(cfg, seed)
+        for columns in state["trajectories"]:
+            callback.trajectories.append(Trajectory(*(column.numpy() for column in columns)))
+            callback._remembered += len(callback.trajectories[-1].rewards)
+        callback._saved = state
+        return callback

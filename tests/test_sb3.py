@@ -1,0 +1,160 @@
+"""The plug-in for Stable-Baselines3: three agents on a task that knows nothing of us."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+pytest.importorskip("stable_baselines3")
+sb3_contrib = pytest.importorskip("sb3_contrib")
+from stable_baselines3 import DQN, PPO, SAC  # noqa: E402
+from stable_baselines3.common.env_util import make_vec_env  # noqa: E402
+from stable_baselines3.common.evaluation import evaluate_policy  # noqa: E402
+from stable_baselines3.common.logger import configure  # noqa: E402
+from stable_baselines3.common.vec_env import VecNormalize  # noqa: E402
+
+from goalgan_bt.sb3 import RecallConfig, RecallTraces, Trajectory  # noqa: E402
+
+FASTEST = np.array([0.2, 0.4], np.float32)
+AGENTS = {"SAC": SAC, "TRPO": sb3_contrib.TRPO, "PPO": PPO}
+RANDOM = -20.0  # a return that is no better than chance; at best it is about -4
+
+
+class Reach(gymnasium.Env):
+    """Walk to the middle of a square, at most 0.2 a step in each direction; 30 steps."""
+
+    def __init__(self):
+        self.observation_space = spaces.Box(-2 * np.ones(2, np.float32), 2 * np.ones(2, np.float32))
+        self.action_space = spaces.Box(
+            np.array([-0.2, -0.4]), np.array([0.2, 0.4]), dtype=np.float32
+        )
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._at, self._age = self.np_random.uniform(-1, 1, 2), 0
+        return self._at.astype(np.float32), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action.astype(np.float32))
+        self._at, self._age = np.clip(self._at + action, -2, 2), self._age + 1
+        return self._at.astype(np.float32), -np.abs(self._at).sum(), False, self._age == 30, {}
+
+
+def agent(name, env, **more):
+    if name == "SAC":
+        small = {"batch_size": 64, "policy_kwargs": {"net_arch": [32, 32]}}
+        more = {"learning_starts": 200, "gamma": 0.9, "learning_rate": 3e-3} | small | more
+    else:
+        size = {"n_steps": 256, "batch_size": 256, "gamma": 0.9, "gae_lambda": 0.9}
+        size |= {"learning_rate": 3e-3} if name == "PPO" else {}
+        more = size | more
+    return AGENTS[name]("MlpPolicy", env, seed=0, device="cpu", **more)
+
+
+def recall(**more):
+    return RecallTraces(RecallConfig(trace_length=5, min_steps=100, **more))
+
+
+@pytest.mark.parametrize(
+    ("name", "steps", "good"), [("SAC", 2000, -10), ("TRPO", 12000, -12), ("PPO", 12000, -12)]
+)
+def test_agents_learn_with_recall_traces(name, steps, good, tmp_path):
+    """To a stated return; saved, loaded and continued; in vector environments."""
+    env = make_vec_env(Reach, n_envs=1 if name == "SAC" else 4, seed=0)
+    model, callback = agent(name, env), recall()
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    before, _ = evaluate_policy(model, env, 20)
+    model.learn(steps, callback=callback)
+    after, _ = evaluate_policy(model, env, 20)
+    assert before < RANDOM < good < after, (before, after)
+    told = callback.turn()
+    assert told["kl"] <= 0.005 and 0 < told["valid"] <= 1 and np.isfinite(told["lower_bound"])
+    assert "recall/threshold" in (tmp_path / "progress.csv").read_text()
+
+    model.save(tmp_path / "agent")
+    callback.save(tmp_path / "recall.pt")
+    model = AGENTS[name].load(tmp_path / "agent", env=env)
+    again = RecallTraces.load(tmp_path / "recall.pt", callback.cfg)
+    assert len(again.trajectories) == len(callback.trajectories)
+    model.learn(500, callback=again, reset_num_timesteps=False)
+    for a, b in zip(callback.trajectories, again.trajectories, strict=False):
+        np.testing.assert_array_equal(a.obs, b.obs)
+    assert len(again.trajectories) > len(callback.trajectories)
+    continued, _ = evaluate_policy(model, env, 20)
+    assert continued > good - 4
+
+
+def test_trajectories_are_what_happened():
+    env = make_vec_env(Reach, n_envs=3, seed=0)
+    callback = recall()
+    agent("PPO", env).learn(1000, callback=callback)
+    assert len(callback.trajectories) >= 30
+    for obs, actions, rewards in callback.trajectories:
+        assert obs.shape == (31, 2) and actions.shape == (30, 2)
+        assert np.abs(actions).max() <= 1 + 1e-6
+        moved = np.clip(obs[:-1] + actions * FASTEST, -2, 2)
+        np.testing.assert_allclose(moved, obs[1:], atol=1e-5)
+        np.testing.assert_allclose(rewards, -np.abs(obs[1:]).sum(axis=1), atol=1e-5)
+
+
+def test_rewards_are_the_environments_own_where_they_are_normalised():
+    env = VecNormalize(make_vec_env(Reach, n_envs=2, seed=0))
+    callback = recall()
+    agent("PPO", env).learn(1000, callback=callback)
+    returns = [one.rewards.sum() for one in callback.trajectories]
+    assert np.mean(returns) < RANDOM / 2  # normalised they would be about 1 a step
+
+
+def test_the_threshold_is_a_percentile_and_the_memory_has_an_end():
+    callback = RecallTraces(RecallConfig(top_percent=20, capacity=100))
+    for i in range(50):
+        path = [(np.zeros(2), np.zeros(2), float(i % 10))] * 5
+        callback._remember(path, np.zeros(2))
+    assert sum(len(one.rewards) for one in callback.trajectories) == 100
+    chosen, threshold = callback.best()
+    assert threshold == 5 * 8 and len(chosen) == 4  # of 20 trajectories those of 8 and 9 a step
+    callback.trajectories.clear()
+    callback.trajectories.append(Trajectory(np.zeros((2, 2)), np.zeros((1, 2)), np.ones(1)))
+    assert callback.best()[1] == 1.0
+
+
+@pytest.mark.parametrize("name", ["SAC", "PPO"])
+def test_imitation_moves_the_mean_and_nothing_else(name):
+    """Towards the recalled actions, within the bound on the KL; the std stays."""
+    env = make_vec_env(Reach, n_envs=1, seed=0)
+    model, callback = agent(name, env), recall(imitation_steps=50, max_kl=0.05, learning_rate=1e-3)
+    model.learn(300, callback=callback)
+    rng = np.random.default_rng(0)
+    states = rng.uniform(-1, 1, (400, 2))
+    towards = np.tile([0.9, -0.9], (400, 1))
+    obs = torch.as_tensor(states).float()
+
+    def now():
+        with torch.no_grad():
+            found = callback._gaussian(obs)
+            mean = (
+                torch.tanh(found.mean) if name == "SAC" else found.mean / torch.tensor([0.2, 0.4])
+            )
+        return mean.numpy(), found.stddev.numpy()
+
+    (mean, std), kl = now(), 0.0
+    for _ in range(10):
+        kl = max(kl, callback._imitate(states, towards, states, 40, states)["kl"])
+    new_mean, new_std = now()
+    assert 0 < kl <= 0.05
+    gap, new_gap = (np.abs(x - towards).mean() for x in (mean, new_mean))
+    assert new_gap < gap - 0.05
+    if name == "PPO":
+        np.testing.assert_array_equal(std, new_std)
+
+
+def test_agents_that_are_not_gaussian_are_refused():
+    with pytest.raises(TypeError, match="Gaussian policy"):
+        DQN("MlpPolicy", "CartPole-v1").learn(10, callback=RecallTraces())
+    with pytest.raises(TypeError, match="Gaussian policy"):
+        PPO("MlpPolicy", make_vec_env(Reach), use_sde=True).learn(10, callback=RecallTraces())
+    with pytest.raises(TypeError, match="vectors of numbers"):
+        PPO("MlpPolicy", "CartPole-v1").learn(10, callback=RecallTraces())
+    with pytest.raises(ValueError, match="nothing was learned"):
+        RecallTraces().save("nowhere")
