@@ -179,7 +179,8 @@ def _row(env: str, method: str, seeds: dict[int, Curve], tables: Tables) -> dict
     }
     for threshold in THRESHOLDS:
         median = np.median([time_to(curve, threshold) for curve in of]) / 1e6
-        row[f"to {threshold:g}"] = f"{median:.2f}" if np.isfinite(median) else "-"
+        digits = 2 if median >= 0.1 else 3  # a grid world takes thousands of steps, not millions
+        row[f"to {threshold:g}"] = f"{median:.{digits}f}" if np.isfinite(median) else "-"
     for kind in ("train", "label", "eval"):
         row[f"{kind} steps"] = f"{np.mean([float(cost[kind]) for cost in costs]) / 1e6:.1f}"
     row["wall s"] = f"{np.mean([float(cost['seconds']) for cost in costs]):.0f}"
