@@ -1,12 +1,17 @@
 """Command lines from dataclasses, whose mistakes end in one line instead of tyro's box."""
 
 import contextlib
+import errno
 import io
 import re
 import sys
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import tyro
+
+from goalgan_bt.progress import complain
+from goalgan_bt.record import RunError
 
 T = TypeVar("T")
 
@@ -38,6 +43,24 @@ def parse(kind: type[T], argv: list[str] | None, prog: str, default: T | None = 
             sys.stdout.write(printed.getvalue())
             raise
         raise UsageError(_one_line(printed.getvalue())) from None
+
+
+def exit_code(work: Callable[[], None]) -> int:
+    """Do some work; whatever its user can mend is told in one line, with exit code 2, or 130 for
+    Ctrl-C."""
+    try:
+        work()
+    except KeyboardInterrupt:
+        complain("interrupted: start again")
+        return 130
+    except OSError as error:
+        full = error.errno == errno.ENOSPC
+        complain("the disk is full: free some space" if full else str(error))
+        return 2
+    except (UsageError, RunError) as error:
+        complain(str(error))
+        return 2
+    return 0
 
 
 def value_of(argv: list[str], flag: str) -> str | None:

@@ -7,7 +7,6 @@ and the same with recall traces: the backward state model q(s_t | a_t, s_{t+1}) 
 backward action model q(a_t | s_{t+1}) learned from the best trajectories, or uniform.
 """
 
-import errno
 import re
 import sys
 import time
@@ -20,10 +19,10 @@ import numpy as np
 
 from goalgan_bt import record
 from goalgan_bt.advantage import gae
-from goalgan_bt.command_line import UsageError, parse, value_of
+from goalgan_bt.command_line import UsageError, exit_code, parse, value_of
 from goalgan_bt.envs.four_rooms import SIZES, FourRooms, Ints
 from goalgan_bt.envs.maze import BoolArray, FloatArray
-from goalgan_bt.progress import complain, say
+from goalgan_bt.progress import say
 
 NAME = re.compile(r"four_rooms_(\d{1,2})")
 FAINT = 0.01  # times that each possible action counts as seen, so that none is impossible
@@ -453,8 +452,8 @@ def from_command_line(argv: list[str]) -> FourRoomsConfig:
 
 def main() -> int:
     """The command line; returns the exit code."""
-    folder = None
-    try:
+
+    def work() -> None:
         cfg = from_command_line(sys.argv[1:])
         folder = record.create_folder(cfg.out, cfg.env, cfg.seed)
         record.write_meta(folder, None)
@@ -466,11 +465,5 @@ def main() -> int:
             f"coverage {measured.success:.3f} after {cfg.total_steps:,} training steps, return "
             f"{measured.discounted:.3f}, {seen} cells visited: {folder}"
         )
-    except KeyboardInterrupt:
-        complain(f"interrupted: {folder or 'nothing'} holds what was measured; start again")
-        return 130
-    except (UsageError, record.RunError, OSError) as error:
-        full = isinstance(error, OSError) and error.errno == errno.ENOSPC
-        complain("the disk is full: free some space" if full else str(error))
-        return 2
-    return 0
+
+    return exit_code(work)

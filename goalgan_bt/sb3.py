@@ -11,9 +11,8 @@ observation: the environment need know nothing of us.
 
 import time
 from collections import deque
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -26,44 +25,11 @@ from torch.distributions import Normal, kl_divergence
 
 from goalgan_bt.backtracking import BacktrackingModel, Transitions, recall_traces
 from goalgan_bt.envs.maze import BoolArray, FloatArray
-from goalgan_bt.settings import BacktrackingConfig
+from goalgan_bt.settings import BacktrackingConfig, RecallConfig
 
 EDGE = 0.999  # of the range of a squashed action, beyond which its inverse is taken as there
 FAR = 5.0  # standard deviations from what was seen at which a trace ends
 KL_SAMPLE = 1024  # states on which the KL of an imitation is bounded
-
-
-@dataclass(frozen=True)
-class RecallConfig:
-    """What to recall and how much of it to imitate."""
-
-    trace_length: int = 20
-    """Steps of a recall trace (paper: 20; with TRPO Hopper 10; Ant and Humanoid 50)."""
-    traces: int = 64
-    """Recall traces per turn."""
-    top_percent: float = 10.0
-    """Share of the remembered trajectories, those of highest return, that teach the model: their
-    lowest return is the threshold L of the paper's section 4, which rises as the agent learns."""
-    capacity: int = 100_000
-    """Steps that are remembered, in whole trajectories, the newest."""
-    min_steps: int = 500
-    """Steps of the best trajectories before which nothing is recalled."""
-    every: int | None = None
-    """Environment steps between two turns; by default a rollout, or 500 for an agent that has
-    none (SAC)."""
-    seeds: Literal["value", "reward"] = "value"
-    """Traces begin at states of which the critic thinks highest, or that were rewarded most (the
-    paper's proxy where there is no critic)."""
-    model_steps: int = 20
-    """Training steps of the backtracking model per turn."""
-    imitation_steps: int = 5
-    """Gradient steps of imitation per turn."""
-    imitation_batch: int = 256
-    """Steps of traces in each."""
-    learning_rate: float = 1e-4
-    """Step size of the imitation's Adam."""
-    max_kl: float = 0.005
-    """Imitation stops where the mean KL of a turn passes this, nats."""
 
 
 class Trajectory(NamedTuple):
@@ -112,6 +78,8 @@ class RecallTraces(BaseCallback):
         self._rng, self._noise = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
         self._remembered, self._spent, self._last = 0, 0.0, 0
         self._saved: dict[str, Any] | None = None
+        self._agent: Any = None  # whose policy the optimiser is for
+        self.last: dict[str, float] = {}  # what the last turn gave
 
     def _init_callback(self) -> None:
         policy: Any = self.model.policy
@@ -134,13 +102,20 @@ class RecallTraces(BaseCallback):
         if self.backtracking is None:
             model_cfg = BacktrackingConfig(batch=256, steps=self.cfg.model_steps)
             self.backtracking = BacktrackingModel(obs_dim, act_dim, 0, model_cfg, self._noise)
-        self._optimiser = torch.optim.Adam(self._learner.parameters(), self.cfg.learning_rate)
+        if self._agent is not self.model:
+            self._agent, self._last = self.model, self.model.num_timesteps
+            self._optimiser = torch.optim.Adam(self._learner.parameters(), self.cfg.learning_rate)
+            self._paths: list[list[tuple[Any, Any, float]]] = [[] for _ in range(self.model.n_envs)]
         if self._saved is not None:
             self.backtracking.load_state_dict(self._saved["model"])
             self._optimiser.load_state_dict(self._saved["optimiser"])
             self._saved = None
-        self._paths: list[list[tuple[Any, Any, float]]] = [[] for _ in range(self.model.n_envs)]
-        self._last = self.num_timesteps
+
+    def _on_training_start(self) -> None:
+        if self.locals["reset_num_timesteps"]:  # then the environments have been reset, too
+            self._last = 0
+            for path in self._paths:
+                path.clear()
 
     def _on_step(self) -> bool:
         given = self.locals
@@ -171,7 +146,8 @@ class RecallTraces(BaseCallback):
         if self.num_timesteps - self._last >= every:
             self._last = self.num_timesteps
             begin = time.perf_counter()
-            for name, value in self.turn().items():
+            self.last = self.turn()
+            for name, value in self.last.items():
                 self.logger.record(f"recall/{name}", value)
             self._spent += time.perf_counter() - begin
             self.logger.record("recall/seconds", self._spent)

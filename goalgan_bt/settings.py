@@ -198,3 +198,36 @@ class CoverageConfig:
     """Episodes per test goal with the stochastic policy (the original: 2 point, 3 ant)."""
     every: int = 2_000_000
     """Training steps between two measurements; one more at the end."""
+
+
+@dataclass(frozen=True)
+class RecallConfig:
+    """Recall traces beside an agent of Stable-Baselines3: what is recalled, how it is imitated."""
+
+    trace_length: int = 20
+    """Steps of a recall trace (paper: 20; with TRPO Hopper 10; Ant and Humanoid 50)."""
+    traces: int = 64
+    """Recall traces per turn."""
+    top_percent: float = 10.0
+    """Share of the remembered trajectories, those of highest return, that teach the model: their
+    lowest return is the threshold L of the paper's section 4, which rises as the agent learns."""
+    capacity: int = 100_000
+    """Steps that are remembered, in whole trajectories, the newest."""
+    min_steps: int = 500
+    """Steps of the best trajectories before which nothing is recalled."""
+    every: int | None = None
+    """Environment steps between two turns; by default a rollout, or 500 for an agent that has
+    none (SAC)."""
+    seeds: Literal["value", "reward"] = "value"
+    """Traces begin at states of which the critic thinks highest, or that were rewarded most (the
+    paper's proxy where there is no critic)."""
+    model_steps: int = 20
+    """Training steps of the backtracking model per turn."""
+    imitation_steps: int = 5
+    """Gradient steps of imitation per turn."""
+    imitation_batch: int = 256
+    """Steps of traces in each."""
+    learning_rate: float = 1e-4
+    """Step size of the imitation's Adam."""
+    max_kl: float = 0.005
+    """Imitation stops where the mean KL of a turn passes this, nats."""

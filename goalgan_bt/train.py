@@ -18,10 +18,11 @@ if __name__ == "__main__":
 
     signal.signal(signal.SIGINT, _leave)
     signal.signal(signal.SIGTERM, _leave)
-    from goalgan_bt import four_rooms
+    from goalgan_bt import four_rooms, locomotion
 
-    if four_rooms.asked_for(sys.argv):  # another learner, which needs none of what follows
-        sys.exit(four_rooms.main())
+    for other in (four_rooms, locomotion):  # learners that need none of what follows
+        if other.asked_for(sys.argv):
+            sys.exit(other.main())
     if {"-h", "--help"} & set(sys.argv):
         from goalgan_bt import command_line, config
 
@@ -41,7 +42,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from goalgan_bt import checkpoint, config, envs, four_rooms, ranks, record, trpo
+from goalgan_bt import checkpoint, config, envs, four_rooms, locomotion, ranks, record, trpo
 from goalgan_bt.advantage import gae
 from goalgan_bt.backtracking import RecallTraces, Steps, consistency, recall_traces
 from goalgan_bt.beside import Beside, group
@@ -479,7 +480,8 @@ def how_to_go_on(folder: Path | None) -> str:
 
 def script() -> None:
     """Entry point of the `goalgan-bt` command."""
-    sys.exit(four_rooms.main() if four_rooms.asked_for(sys.argv) else main())
+    others = [other.main for other in (four_rooms, locomotion) if other.asked_for(sys.argv)]
+    sys.exit((others or [main])[0]())
 
 
 if __name__ == "__main__":

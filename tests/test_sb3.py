@@ -158,3 +158,18 @@ def test_agents_that_are_not_gaussian_are_refused():
         PPO("MlpPolicy", "CartPole-v1").learn(10, callback=RecallTraces())
     with pytest.raises(ValueError, match="nothing was learned"):
         RecallTraces().save("nowhere")
+
+
+def test_learning_goes_on_where_it_was_or_anew():
+    """A second call of `learn` keeps the unfinished episodes; one that begins anew drops them."""
+    env = make_vec_env(Reach, n_envs=2, seed=0)
+    model, callback = agent("PPO", env, n_steps=40, batch_size=80), recall()
+    model.learn(80, callback=callback)  # 40 steps each: an episode of 30 and 10 of the next
+    assert [len(path) for path in callback._paths] == [10, 10]
+    model.learn(80, callback=callback, reset_num_timesteps=False)
+    assert {len(one.rewards) for one in callback.trajectories} == {30}
+    assert [len(path) for path in callback._paths] == [20, 20]
+    before = len(callback.trajectories)
+    model.learn(80, callback=callback)
+    assert {len(one.rewards) for one in callback.trajectories} == {30}
+    assert len(callback.trajectories) == before + 2

@@ -1,0 +1,178 @@
+"""Recall traces for TRPO and SAC on locomotion (Goyal et al. 2019, sections 5.4 and 5.5).
+
+    python -m goalgan_bt.train --env hopper --method trpo --backtracking.trace-length 10
+
+gymnasium's tasks and the agents of sb3-contrib and Stable-Baselines3, with the callback of
+`goalgan_bt.sb3`; a trace length of 0 is the agent alone.
+"""
+
+import signal
+import sys
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from goalgan_bt import record
+from goalgan_bt.command_line import UsageError, exit_code, parse, value_of
+from goalgan_bt.progress import say
+from goalgan_bt.settings import RecallConfig
+
+TASKS = {
+    "half_cheetah": "HalfCheetah-v5",
+    "ant": "Ant-v5",
+    "walker2d": "Walker2d-v5",
+    "hopper": "Hopper-v5",
+    "humanoid": "Humanoid-v5",
+}
+# The paper's tables; it has no TRPO on the Humanoid.
+TRACE_LENGTH = {"half_cheetah": 20, "walker2d": 20, "hopper": 20, "ant": 50, "humanoid": 50}
+TRPO_TRACE_LENGTH = TRACE_LENGTH | {"hopper": 10}
+REPORTS = 50  # per run
+BATCH = 4096  # steps of a TRPO update
+TEST_SEED = 10_000  # other first states than in training
+
+
+@dataclass(frozen=True)
+class LocomotionConfig:
+    """Learn to run with TRPO or SAC, with or without recall traces."""
+
+    env: str = "hopper"
+    """half_cheetah, ant, walker2d, hopper or humanoid (gymnasium's, version 5)."""
+    method: Literal["trpo", "sac"] = "trpo"
+    """The agent: sb3-contrib's TRPO or Stable-Baselines3's SAC."""
+    seed: int = 0
+    """Seed of everything random."""
+    total_steps: int = 1_000_000
+    """Environment steps of training."""
+    out: Path = Path("runs")
+    """Folder of runs; this run gets a folder of its own in it."""
+    num_envs: int = 4
+    """Environments side by side (SAC: 1)."""
+    episodes: int = 5
+    """Episodes of the deterministic policy in each measurement."""
+    backtracking: RecallConfig = field(default_factory=RecallConfig)
+
+
+def asked_for(argv: list[str]) -> bool:
+    """Whether a command line names one of these environments."""
+    return value_of(argv, "--env") in TASKS
+
+
+def preset(env: str, method: str) -> LocomotionConfig:
+    """The default settings of a task and an agent.
+
+    Raises:
+        UsageError: if there is no such task or agent.
+    """
+    if env not in TASKS:
+        raise UsageError(f"unknown environment {env!r}: choose one of {', '.join(TASKS)}")
+    if method not in ("trpo", "sac"):
+        raise UsageError(f"unknown method {method!r}: choose trpo or sac")
+    if method == "sac":
+        length = RecallConfig(trace_length=TRACE_LENGTH[env])
+        return LocomotionConfig(env, "sac", total_steps=200_000, num_envs=1, backtracking=length)
+    return LocomotionConfig(env, backtracking=RecallConfig(trace_length=TRPO_TRACE_LENGTH[env]))
+
+
+def from_command_line(argv: list[str]) -> LocomotionConfig:
+    """The settings that a command line asks for.
+
+    Raises:
+        UsageError: for an unknown flag, a value of the wrong kind, or one that makes no sense.
+        SystemExit: after `--help`.
+    """
+    default = preset(value_of(argv, "--env") or "hopper", value_of(argv, "--method") or "trpo")
+    cfg = parse(LocomotionConfig, argv, "python -m goalgan_bt.train", default)
+    for name in ("total_steps", "num_envs", "episodes"):
+        if getattr(cfg, name) < 1:
+            raise UsageError(f"--{name.replace('_', '-')} must be 1 or more")
+    if cfg.seed < 0 or cfg.backtracking.trace_length < 0:
+        raise UsageError("--seed and --backtracking.trace-length must be 0 or more")
+    return cfg
+
+
+def train(cfg: LocomotionConfig, folder: Path) -> float:
+    """Learn to run; writes `metrics.csv` and `policy.pt` (a state_dict) into the run folder.
+
+    Args:
+        cfg: settings.
+        folder: the run folder.
+
+    Returns:
+        The last measured return of the deterministic policy.
+
+    Raises:
+        UsageError: if the extra `sb3` is missing.
+    """
+    try:
+        import torch
+        from sb3_contrib import TRPO
+        from stable_baselines3 import SAC
+        from stable_baselines3.common.env_util import make_vec_env
+        from stable_baselines3.common.evaluation import evaluate_policy
+        from stable_baselines3.common.vec_env import VecNormalize, sync_envs_normalization
+
+        from goalgan_bt.sb3 import RecallTraces
+    except ImportError:
+        raise UsageError('locomotion needs the extra sb3: pip install "goalgan_bt[sb3]"') from None
+    torch.set_num_threads(1)
+    env: Any = make_vec_env(TASKS[cfg.env], cfg.num_envs, seed=cfg.seed)
+    test_env: Any = make_vec_env(TASKS[cfg.env], 1, seed=TEST_SEED + cfg.seed)
+    if cfg.method == "trpo":  # as rllab's, it sees normalised observations
+        env, test_env = VecNormalize(env), VecNormalize(test_env, training=False, norm_reward=False)
+        steps = max(1, BATCH // cfg.num_envs)
+        agent: Any = TRPO("MlpPolicy", env, n_steps=steps, seed=cfg.seed, device="cpu")
+    else:
+        agent = SAC("MlpPolicy", env, seed=cfg.seed, device="cpu")
+    traced = cfg.backtracking.trace_length > 0
+    recall = RecallTraces(cfg.backtracking, cfg.seed) if traced else None
+
+    rows: list[dict[str, str]] = []
+    began, tested, mean = time.perf_counter(), 0, float("nan")
+    while agent.num_timesteps < cfg.total_steps:
+        wanted = cfg.total_steps * (len(rows) + 1) // REPORTS - agent.num_timesteps
+        agent.learn(max(1, wanted), callback=recall, reset_num_timesteps=False)
+        if cfg.method == "trpo":
+            sync_envs_normalization(env, test_env)
+        found: Any = evaluate_policy(agent, test_env, cfg.episodes, return_episode_rewards=True)
+        returns, lengths = found
+        tested, mean = tested + sum(lengths), sum(returns) / len(returns)
+        seconds = time.perf_counter() - began
+        row = {
+            "iteration": len(rows) + 1,
+            "steps/train": agent.num_timesteps,
+            "steps/label": 0,
+            "steps/eval": tested,
+            "time/total": round(seconds, 1),
+            "time/fps": round(agent.num_timesteps / seconds),
+            "eval/return": round(mean, 2),
+        }
+        if recall is not None:
+            row |= {f"recall/{name}": round(value, 6) for name, value in recall.last.items()}
+        rows.append({name: str(value) for name, value in row.items()})
+        columns = list(dict.fromkeys(name for one in rows for name in one))
+        record.write_table(folder / "metrics.csv", columns, rows)
+        left = seconds * max(0.0, cfg.total_steps / agent.num_timesteps - 1)
+        say(f"steps {agent.num_timesteps:,}  return {mean:.1f}  left {left / 60:.0f} min")
+    state = agent.policy.state_dict()
+    record.write_atomically(folder / "policy.pt", lambda file: torch.save(state, file))
+    (folder / record.ENDED).write_text("complete\n")
+    return mean
+
+
+def main() -> int:
+    """The command line; returns the exit code."""
+
+    def work() -> None:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.default_int_handler)
+        cfg = from_command_line(sys.argv[1:])
+        folder = record.create_folder(cfg.out, cfg.env, cfg.seed)
+        record.write_meta(folder, None)
+        record.write_settings(folder, asdict(cfg))
+        say(f"run folder: {folder}")
+        found = train(cfg, folder)
+        say(f"return {found:.1f} after {cfg.total_steps:,} training steps: {folder}")
+
+    return exit_code(work)
