@@ -1,7 +1,7 @@
 """Where policies go in four rooms: visitation counts by method and size (Goyal et al. 2019, 5.2).
 
     python -m goalgan_bt.study four_rooms
-    python benchmarks/visits.py runs/studies/four_rooms --out docs/studies/four_rooms
+    python benchmarks/visits.py runs/studies/four_rooms docs/studies/four_rooms
 
 writes visits.png, mean counts over seeds, and visits.csv: in how many of the free cells the trained
 policy was in its last fifty episodes, and how many were visited in training.
@@ -9,7 +9,6 @@ policy was in its last fifty episodes, and how many were visited in training.
 
 import csv
 import io
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,6 @@ from goalgan_bt import record
 from goalgan_bt.command_line import UsageError, parse
 from goalgan_bt.progress import complain, say
 
-METHODS = ("actor_critic", "per", "recall_traces", "random_model")
 COLUMNS = ("env", "method", "seeds", "free", "trained", "training", "return")
 
 
@@ -32,21 +30,22 @@ class Settings:
     """Draw and count where policies went in four rooms."""
 
     runs: tyro.conf.Positional[Path]
-    """A folder with run folders somewhere in it."""
-    out: Path = Path("docs/studies/four_rooms")
+    """The run folders of a study: ENV/METHOD-sSEED/RUN."""
+    out: tyro.conf.Positional[Path]
     """Where visits.png and visits.csv go."""
 
 
 def visits(folder: Path) -> dict[tuple[str, str], list[dict[str, np.ndarray]]]:
-    """The counts of all runs in a folder by environment and method."""
+    """The counts of a study's runs by environment and method."""
     found: dict[tuple[str, str], list[dict[str, np.ndarray]]] = {}
-    for file in sorted(folder.rglob("visits.npz")):
-        settings = json.loads((file.parent / "config.json").read_text())
+    newest = {file.parents[1]: file for file in sorted(folder.glob("*/*-s*/*/visits.npz"))}
+    for place, file in newest.items():  # a run that was cut off was made again
         _, rows = record.read_metrics(file.parent)
         with np.load(file) as counts:
             run = {name: counts[name] for name in ("trained", "training")}
         run["return"] = np.array(float(rows[-1]["eval/return"]))
-        found.setdefault((settings["env"], settings["method"]), []).append(run)
+        method = place.name.rpartition("-s")[0]
+        found.setdefault((place.parent.name, method), []).append(run)
     if not found:
         raise UsageError(f"{folder} holds no run of four rooms: run the study first")
     return found
@@ -69,7 +68,7 @@ def row(env: str, method: str, runs: list[dict[str, np.ndarray]]) -> dict[str, s
 def draw(found: dict[tuple[str, str], list[dict[str, np.ndarray]]]) -> Figure:
     """A map of the trained policy's visits for each method and size, on one logarithmic scale."""
     envs = sorted({env for env, _ in found})
-    methods = [method for method in METHODS if any((env, method) in found for env in envs)]
+    methods = sorted({method for _, method in found})
     figure = Figure(figsize=(2.6 * len(envs) + 1, 2.6 * len(methods)), layout="constrained")
     axes = figure.subplots(len(methods), len(envs), squeeze=False)
     for i, method in enumerate(methods):

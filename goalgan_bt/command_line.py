@@ -4,6 +4,7 @@ import contextlib
 import errno
 import io
 import re
+import signal
 import sys
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -48,10 +49,12 @@ def parse(kind: type[T], argv: list[str] | None, prog: str, default: T | None = 
 def exit_code(work: Callable[[], None]) -> int:
     """Do some work; whatever its user can mend is told in one line, with exit code 2, or 130 for
     Ctrl-C."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     try:
         work()
     except KeyboardInterrupt:
-        complain("interrupted: start again")
+        complain("interrupted: what was measured is in the run folder; start again")
         return 130
     except OSError as error:
         full = error.errno == errno.ENOSPC

@@ -155,7 +155,9 @@ def preset(env: str) -> Config:
         ConfigError: if there is no such environment.
     """
     if env not in envs.NAMES:
-        raise ConfigError(f"unknown environment {env!r}: choose one of {', '.join(envs.NAMES)}")
+        others = ", four_rooms_N, half_cheetah, ant, walker2d, hopper, humanoid"
+        names = ", ".join(envs.NAMES) + others
+        raise ConfigError(f"unknown environment {env!r}: choose one of {names}")
     cfg = replace(ANT if env.startswith("ant") else POINT, env=env)
     if env == "point_nd":
         # The box is 0.6 m thin: among its neighbours' outcomes a goal's own is lost, and noise

@@ -27,14 +27,14 @@ from goalgan_bt.progress import say
 NAME = re.compile(r"four_rooms_(\d{1,2})")
 FAINT = 0.01  # times that each possible action counts as seen, so that none is impossible
 FLOOR = 1e-4  # of a priority, so that nothing is never replayed
-REPORTS = 60  # per run
+BETWEEN = 1.05  # factor of the steps between two reports: early on much changes in a few
 EPISODES = 50  # with which a policy is measured
 
 
 @dataclass(frozen=True)
 class ReplayConfig:
-    """Prioritised experience replay (Schaul et al. 2016). Its default depends on the size: the
-    paper's table."""
+    """Prioritised experience replay, as self-imitation has it (Oh et al. 2018). The default depends
+    on the size: the paper's table."""
 
     batch: int = 1000
     """Transitions per replay update."""
@@ -47,7 +47,7 @@ class ReplayConfig:
     capacity: int = 100_000
     """Transitions that are kept, the newest."""
     rate: float = 0.5
-    """Step size of the policy."""
+    """Step size of the policy, per replayed step: a larger batch also makes a larger update."""
 
 
 @dataclass(frozen=True)
@@ -196,6 +196,7 @@ class Recall:
     def __init__(self, rooms: FourRooms, cfg: TracesConfig, learned: bool) -> None:
         self._rooms, self.cfg, self._learned = rooms, cfg, learned
         self.best: list[Trajectory] = []  # the shortest first, which have the highest return
+        self._model: FloatArray | None = None  # q(a | s') as long as they stay the same
 
     def add(self, trajectory: Trajectory) -> None:
         """Keep an episode that reached the goal, if it is among the best."""
@@ -203,30 +204,27 @@ class Recall:
             self.best.append(trajectory)
             self.best.sort(key=lambda known: len(known.actions))
             del self.best[self.cfg.trajectories :]
+            self._model = None
 
     def action_model(self) -> FloatArray:
         """q(a | s'), (S, A): how often each action led to s' in the best trajectories, which is
         its maximum likelihood; 0 for what cannot have led there."""
+        if self._model is not None:
+            return self._model
         times = np.full(self._rooms.ways.shape, FAINT)
         if self._learned:
             for states, actions, _ in self.best:
                 np.add.at(times, (states[1:], actions), 1.0)
         times = times * (self._rooms.ways > 0)
-        return np.asarray(times / times.sum(axis=1, keepdims=True))
+        self._model = np.asarray(times / times.sum(axis=1, keepdims=True))
+        return self._model
 
-    def seed(self, values: FloatArray, discount: float) -> int:
-        """Of the states that the best trajectories reached, the one that was worth most to reach
-        (Algorithm 2): its reward and what the critic says of it."""
-        reached = np.unique(np.concatenate([known.states[1:] for known in self.best]))
-        worth = np.where(reached == self._rooms.goal, 1.0, discount * values[reached])
-        return int(reached[worth.argmax()])
-
-    def traces(self, seed: int, rng: np.random.Generator) -> tuple[Ints, Ints]:
-        """Recall traces from a state, the step nearest to it first: states and actions, both
-        (length, number)."""
+    def traces(self, rng: np.random.Generator) -> tuple[Ints, Ints]:
+        """Recall traces from the goal, than whose reward nothing is worth more (Algorithm 2), the
+        step nearest to it first: states and actions, both (length, number)."""
         model, rooms = self.action_model(), self._rooms
         states, actions = np.zeros((2, self.cfg.length, self.cfg.number), dtype=np.int64)
-        following = np.full(self.cfg.number, seed)
+        following = np.full(self.cfg.number, rooms.goal)
         for t in range(self.cfg.length):
             actions[t] = pick(model[following], rng)
             way = rng.random(self.cfg.number) * rooms.ways[following, actions[t]]
@@ -234,10 +232,10 @@ class Recall:
             following = states[t]
         return states, actions
 
-    def teach(self, learner: ActorCritic, discount: float, rng: np.random.Generator) -> None:
+    def teach(self, learner: ActorCritic, rng: np.random.Generator) -> None:
         """Let the policy imitate recall traces, once there is a trajectory to learn from."""
         for _ in range(self.cfg.updates if self.best else 0):
-            states, actions = self.traces(self.seed(learner.values, discount), rng)
+            states, actions = self.traces(rng)
             ones = np.ones(states.size)
             learner.reinforce(states.ravel(), actions.ravel(), ones, self.cfg.rate)
 
@@ -317,6 +315,7 @@ def measure(
     lengths = first.sum(axis=0)
     discounted = float((won * cfg.discount ** (lengths - 1)).mean())
     visits = np.bincount(batch.states[first], minlength=len(rooms.cells))
+    visits[rooms.goal] = won.sum()
     return Measured(float(won.mean()), discounted, visits, batch.states.size)
 
 
@@ -368,10 +367,10 @@ def train(cfg: FourRoomsConfig, folder: Path) -> Measured:
             for trajectory in batch.ended:
                 recall.add(trajectory)
             if update % cfg.traces.every == 0:
-                recall.teach(learner, cfg.discount, rng)
+                recall.teach(learner, rng)
 
         if steps >= min(next_report, cfg.total_steps):
-            next_report = steps + cfg.total_steps / REPORTS
+            next_report = BETWEEN * steps
             measured = measure(rooms, learner, cfg, test_rng)
             tested += measured.steps
             seconds = time.perf_counter() - began
@@ -419,13 +418,10 @@ def asked_for(argv: list[str]) -> bool:
     return NAME.fullmatch(value_of(argv, "--env") or "") is not None
 
 
-COUNTS = (
-    "total_steps num_envs steps horizon replay.batch replay.every replay.capacity traces.length "
-    "traces.number traces.every traces.trajectories"
-)
-RATES = (
-    "seed policy_rate value_rate replay.rate replay.alpha replay.beta traces.rate traces.updates"
-)
+COUNTS = "total_steps steps replay.every traces.every traces.trajectories"
+SIZES_OF_TABLES = "num_envs horizon replay.batch replay.capacity traces.length traces.number"
+RATES = "seed policy_rate replay.rate traces.rate traces.updates"
+SHARES = "discount gae_lambda value_rate replay.alpha replay.beta"
 
 
 def from_command_line(argv: list[str]) -> FourRoomsConfig:
@@ -439,8 +435,9 @@ def from_command_line(argv: list[str]) -> FourRoomsConfig:
     cfg = parse(FourRoomsConfig, argv, "python -m goalgan_bt.train", default)
     for names, low, high in (
         (COUNTS, 1, 10**9),
+        (SIZES_OF_TABLES, 1, 10**5),
         (RATES, 0, 10**9),
-        ("discount gae_lambda", 0, 1),
+        (SHARES, 0, 1),
     ):
         for name in names.split():
             value = attrgetter(name)(cfg)

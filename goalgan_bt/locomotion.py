@@ -6,7 +6,6 @@ gymnasium's tasks and the agents of sb3-contrib and Stable-Baselines3, with the 
 `goalgan_bt.sb3`; a trace length of 0 is the agent alone.
 """
 
-import signal
 import sys
 import time
 from dataclasses import asdict, dataclass, field
@@ -87,8 +86,10 @@ def from_command_line(argv: list[str]) -> LocomotionConfig:
     for name in ("total_steps", "num_envs", "episodes"):
         if getattr(cfg, name) < 1:
             raise UsageError(f"--{name.replace('_', '-')} must be 1 or more")
-    if cfg.seed < 0 or cfg.backtracking.trace_length < 0:
-        raise UsageError("--seed and --backtracking.trace-length must be 0 or more")
+    if cfg.seed < 0:
+        raise UsageError("--seed must be 0 or more")
+    if cfg.backtracking.trace_length and (problem := cfg.backtracking.problem()):
+        raise UsageError(problem)
     return cfg
 
 
@@ -165,8 +166,6 @@ def main() -> int:
     """The command line; returns the exit code."""
 
     def work() -> None:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.default_int_handler)
         cfg = from_command_line(sys.argv[1:])
         folder = record.create_folder(cfg.out, cfg.env, cfg.seed)
         record.write_meta(folder, None)

@@ -11,6 +11,7 @@ observation: the environment need know nothing of us.
 
 import time
 from collections import deque
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -28,16 +29,18 @@ from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.settings import BacktrackingConfig, RecallConfig
 
 EDGE = 0.999  # of the range of a squashed action, beyond which its inverse is taken as there
-FAR = 5.0  # standard deviations from what was seen at which a trace ends
+FAR = 3.0  # root mean square of the standard deviations from what was seen at which a trace ends
 KL_SAMPLE = 1024  # states on which the KL of an imitation is bounded
 
 
 class Trajectory(NamedTuple):
-    """One episode: observations (T + 1, obs_dim), actions (T, act_dim) in [-1, 1], rewards (T,)."""
+    """One episode: observations (T + 1, obs_dim), actions (T, act_dim) in [-1, 1], rewards (T,),
+    and whether its last state ended it, or time ran out."""
 
     obs: FloatArray
     actions: FloatArray
     rewards: FloatArray
+    terminated: bool
 
 
 class Seen:
@@ -53,7 +56,8 @@ class Seen:
 
     def valid(self, states: FloatArray) -> BoolArray:
         """Whether each state (n, state_dim) is finite and not far away, (n,)."""
-        return np.asarray((np.abs(states - self._mean) < FAR * self._std).all(axis=1))
+        away = np.square((states - self._mean) / self._std).mean(axis=1)
+        return np.asarray(np.isfinite(away) & (away < FAR**2))
 
 
 class RecallTraces(BaseCallback):
@@ -65,29 +69,37 @@ class RecallTraces(BaseCallback):
         seed: of the model and the traces.
         verbose: as of every callback.
 
-    Raises (when learning begins):
-        TypeError: if the agent's policy is no Gaussian (without state-dependent exploration), or
-            its observations or actions are not vectors.
+    Raises:
+        ValueError: for settings that make no sense.
+        TypeError: when learning begins, if the agent's policy is no Gaussian (without memory or
+            state-dependent exploration), or its observations or actions are not vectors.
     """
 
     def __init__(self, cfg: RecallConfig | None = None, seed: int = 0, verbose: int = 0) -> None:
         super().__init__(verbose)
         self.cfg = cfg or RecallConfig()
+        if problem := self.cfg.problem():
+            raise ValueError(problem)
         self.trajectories: deque[Trajectory] = deque()
         self.backtracking: BacktrackingModel | None = None
         self._rng, self._noise = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
         self._remembered, self._spent, self._last = 0, 0.0, 0
-        self._saved: dict[str, Any] | None = None
+        self._moments: dict[str, Any] | None = None  # of a saved optimiser
         self._agent: Any = None  # whose policy the optimiser is for
         self.last: dict[str, float] = {}  # what the last turn gave
+
+    def _model(self, obs_dim: int, act_dim: int) -> BacktrackingModel:
+        cfg = BacktrackingConfig(batch=256, steps=self.cfg.model_steps)
+        return BacktrackingModel(obs_dim, act_dim, 0, cfg, self._noise)
 
     def _init_callback(self) -> None:
         policy: Any = self.model.policy
         space, actions = self.model.observation_space, self.model.action_space
-        if not isinstance(policy, (ActorCriticPolicy, SACPolicy)) or self.model.use_sde:
+        known = isinstance(policy, (ActorCriticPolicy, SACPolicy))
+        if not known or hasattr(policy, "lstm_actor") or self.model.use_sde:
             raise TypeError(
-                "RecallTraces needs an agent with a Gaussian policy and without state-dependent "
-                "exploration, such as SAC, TRPO, PPO or A2C"
+                "RecallTraces needs an agent with a Gaussian policy, without memory or "
+                "state-dependent exploration, such as SAC, TRPO, PPO or A2C"
             )
         if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
             raise TypeError(f"RecallTraces needs observations that are vectors, not {space}")
@@ -98,18 +110,15 @@ class RecallTraces(BaseCallback):
         if self._squashed:
             self._learner = policy.actor
         self._low, self._high = actions.low.astype(float), actions.high.astype(float)
-        obs_dim, act_dim = space.shape[0], actions.shape[0]
         if self.backtracking is None:
-            model_cfg = BacktrackingConfig(batch=256, steps=self.cfg.model_steps)
-            self.backtracking = BacktrackingModel(obs_dim, act_dim, 0, model_cfg, self._noise)
+            self.backtracking = self._model(space.shape[0], actions.shape[0])
         if self._agent is not self.model:
             self._agent, self._last = self.model, self.model.num_timesteps
             self._optimiser = torch.optim.Adam(self._learner.parameters(), self.cfg.learning_rate)
             self._paths: list[list[tuple[Any, Any, float]]] = [[] for _ in range(self.model.n_envs)]
-        if self._saved is not None:
-            self.backtracking.load_state_dict(self._saved["model"])
-            self._optimiser.load_state_dict(self._saved["optimiser"])
-            self._saved = None
+        if self._moments is not None:
+            _restore(self._optimiser, self._moments)
+            self._moments = None
 
     def _on_training_start(self) -> None:
         if self.locals["reset_num_timesteps"]:  # then the environments have been reset, too
@@ -127,13 +136,17 @@ class RecallTraces(BaseCallback):
         for i, path in enumerate(self._paths):
             path.append((last_obs[i].copy(), told[i], float(rewards[i])))
             if given["dones"][i]:
-                self._remember(path, given["infos"][i]["terminal_observation"])
+                info = given["infos"][i]
+                timeout = info.get("TimeLimit.truncated", False)
+                self._remember(path, info["terminal_observation"], not timeout)
                 path.clear()
         return True
 
-    def _remember(self, path: list[tuple[Any, Any, float]], last_obs: FloatArray) -> None:
-        obs, actions, rewards = zip(*path, strict=True)
-        ended = Trajectory(np.array([*obs, last_obs]), np.array(actions), np.array(rewards))
+    def _remember(
+        self, path: list[tuple[Any, Any, float]], last_obs: FloatArray, terminated: bool
+    ) -> None:
+        obs, actions, rewards = map(np.array, zip(*path, strict=True))
+        ended = Trajectory(np.concatenate([obs, last_obs[None]]), actions, rewards, terminated)
         self.trajectories.append(ended)
         self._remembered += len(path)
         while self._remembered - len(self.trajectories[0].rewards) >= self.cfg.capacity:
@@ -141,9 +154,8 @@ class RecallTraces(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         # The agent has just learned, and what it collects next is collected by the policy as it
-        # will be then: the moment to change it. SAC has such a moment every few steps.
-        every = self.cfg.every or (500 if self._squashed else 1)
-        if self.num_timesteps - self._last >= every:
+        # will be then: the moment to change it.
+        if self.num_timesteps - self._last >= self.cfg.every:
             self._last = self.num_timesteps
             begin = time.perf_counter()
             self.last = self.turn()
@@ -155,8 +167,8 @@ class RecallTraces(BaseCallback):
     def best(self) -> tuple[list[Trajectory], float]:
         """The trajectories whose return is in the top percent, and the lowest of those returns."""
         returns = np.array([trajectory.rewards.sum() for trajectory in self.trajectories])
-        if not len(returns):
-            return [], np.nan
+        if not len(returns) or returns.min() == returns.max():
+            return [], np.nan  # none is better than another
         most = max(1, round(len(returns) * self.cfg.top_percent / 100))
         threshold = np.sort(returns)[-most]
         chosen = zip(self.trajectories, returns, strict=True)
@@ -167,8 +179,8 @@ class RecallTraces(BaseCallback):
 
         Returns:
             threshold: L; action_nll, state_nll: see `BacktrackingModel`; valid: share of the steps
-            of the traces before they ended; loss: -log pi of the traces, nats; kl; lower_bound:
-            see `_imitate`. Nothing while there is too little to learn from.
+            of the traces before they ended; loss, kl, log_ratio: see `_imitate`. Nothing while
+            there is too little to learn from.
         """
         chosen, threshold = self.best()
         total = sum(len(one.rewards) for one in chosen)
@@ -188,7 +200,12 @@ class RecallTraces(BaseCallback):
         self.backtracking.seen = 0  # none of it is held out: it may have been there before
         metrics = {"threshold": threshold, **self.backtracking.fit(data)}
 
-        worth = self._values(following) if self.cfg.seeds == "value" else rewards
+        worth = rewards
+        if self.cfg.seeds == "value":  # of reaching a state: where it ends, nothing follows
+            ends = np.cumsum([len(one.rewards) for one in chosen]) - 1
+            future = self._values(following)
+            future[ends[[one.terminated for one in chosen]]] = 0.0
+            worth = rewards + self._agent.gamma * future
         seeds = following[np.argsort(worth)[-self.cfg.traces :]].astype(float)
         nowhere = np.empty((len(seeds), 0))
         traces = recall_traces(self.backtracking, space, seeds, nowhere, self.cfg.trace_length)
@@ -196,7 +213,7 @@ class RecallTraces(BaseCallback):
         if traces.valid.any():
             after = np.concatenate([seeds[None], traces.states[:-1]])[traces.valid]
             recalled = traces.states[traces.valid], traces.actions[traces.valid], after
-            metrics |= self._imitate(*recalled, len(seeds), states)
+            metrics |= self._imitate(*recalled, states)
         return metrics
 
     def _gaussian(self, obs: Tensor) -> Normal:
@@ -225,20 +242,19 @@ class RecallTraces(BaseCallback):
         states: FloatArray,
         actions: FloatArray,
         following: FloatArray,
-        traces: int,
         seen: FloatArray,
     ) -> dict[str, float]:
-        """Maximise log pi(a | s) of recalled steps, in the mean of the policy only.
+        """Maximise log pi(a | s) of recalled steps. The gradient goes through the mean only; the
+        std of SAC's policy, which shares layers with the mean, may follow.
 
         Args:
             states, actions, following: (n, obs_dim), (n, act_dim) in [-1, 1], (n, obs_dim).
-            traces: how many they are of.
             seen: (m, obs_dim) states on which the KL is bounded.
 
         Returns:
-            loss and kl; lower_bound: of log p(R > L) (section 4), sum over a trace of
-            log pi(a | s) - log q(a | s'), nats: the world's own transitions are left out, as if
-            q(s | a, s') were exact.
+            loss: -log pi, nats; kl: on those states; log_ratio: log pi(a | s) - log q(a | s')
+            before the imitation, nats per step: of the paper's lower bound of log p(R > L)
+            (section 4) the part that is known; the world's transitions are not.
         """
         obs, goals = self._tensor(states), self._tensor(actions)
         if self._squashed:
@@ -252,11 +268,11 @@ class RecallTraces(BaseCallback):
         reference = self._tensor(seen[rows])
         with torch.no_grad():
             old, before = self._gaussian(reference), self._gaussian(obs)
-            log_pi = (before.log_prob(goals) + slope).sum()
+            log_pi = (before.log_prob(goals) + slope).sum(dim=1).mean().item()
         assert self.backtracking is not None
         log_q = self.backtracking.action_log_density(
             torch.as_tensor(following).float(), torch.as_tensor(actions).float()
-        ).sum()
+        ).mean()
         loss, kl, params = np.nan, 0.0, list(self._learner.parameters())
         for step in range(self.cfg.imitation_steps):
             some = torch.from_numpy(self._rng.integers(len(obs), size=self.cfg.imitation_batch))
@@ -276,17 +292,26 @@ class RecallTraces(BaseCallback):
                         param.copy_(value)
                     break
             kl = new_kl
-        bound = (log_pi.cpu() - log_q).item() / traces
-        return {"loss": loss, "kl": kl, "lower_bound": bound}
+        return {"loss": loss, "kl": kl, "log_ratio": log_pi - log_q.item()}
 
     def save(self, path: Path | str) -> None:
-        """Write model and trajectories, to go on with a saved agent (`load`)."""
-        if self.backtracking is None:
+        """Write settings, model and trajectories, to go on with a saved agent (`load`).
+
+        Raises:
+            ValueError: if nothing was learned yet.
+        """
+        if self.backtracking is None or not self.trajectories:
             raise ValueError("nothing was learned yet: save after `learn`")
+        moments = self._optimiser.state_dict() if self._agent is not None else self._moments
         state = {
+            "cfg": asdict(self.cfg),
             "model": self.backtracking.state_dict(),
-            "optimiser": self._optimiser.state_dict(),
-            "trajectories": [[torch.from_numpy(x) for x in one] for one in self.trajectories],
+            "model_optimiser": self.backtracking.optimiser.state_dict(),
+            "optimiser": moments,
+            "trajectories": [
+                [*(torch.from_numpy(x) for x in one[:3]), one.terminated]
+                for one in self.trajectories
+            ],
         }
         torch.save(state, path)
 
@@ -294,11 +319,30 @@ class RecallTraces(BaseCallback):
     def load(
         cls, path: Path | str, cfg: RecallConfig | None = None, seed: int = 0
     ) -> "RecallTraces":
-        """What `save` wrote, to be given to `learn` of the loaded agent."""
+        """What `save` wrote, to be given to `learn` of the loaded agent.
+
+        Args:
+            path: of the file.
+            cfg: settings; those that were saved if None.
+            seed: as of a new one.
+        """
         state = torch.load(path, weights_only=True)
-        callback = cls(cfg, seed)
-        for columns in state["trajectories"]:
-            callback.trajectories.append(Trajectory(*(column.numpy() for column in columns)))
-            callback._remembered += len(callback.trajectories[-1].rewards)
-        callback._saved = state
+        callback = cls(cfg or RecallConfig(**state["cfg"]), seed)
+        for obs, actions, rewards, terminated in state["trajectories"]:
+            one = Trajectory(obs.numpy(), actions.numpy(), rewards.numpy(), terminated)
+            callback.trajectories.append(one)
+            callback._remembered += len(one.rewards)
+        first = callback.trajectories[0]
+        callback.backtracking = callback._model(first.obs.shape[1], first.actions.shape[1])
+        callback.backtracking.load_state_dict(state["model"])
+        _restore(callback.backtracking.optimiser, state["model_optimiser"])
+        callback._moments = state["optimiser"]
         return callback
+
+
+def _restore(optimiser: torch.optim.Optimizer, state: dict[str, Any]) -> None:
+    """Take over what an optimiser remembers, but not its learning rate."""
+    rates = [group["lr"] for group in optimiser.param_groups]
+    optimiser.load_state_dict(state)
+    for group, rate in zip(optimiser.param_groups, rates, strict=True):
+        group["lr"] = rate

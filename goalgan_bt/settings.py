@@ -210,14 +210,14 @@ class RecallConfig:
     """Recall traces per turn."""
     top_percent: float = 10.0
     """Share of the remembered trajectories, those of highest return, that teach the model: their
-    lowest return is the threshold L of the paper's section 4, which rises as the agent learns."""
+    lowest return is the threshold L of the paper's section 4, which rises as the agent learns.
+    While all returns are the same none is."""
     capacity: int = 100_000
     """Steps that are remembered, in whole trajectories, the newest."""
     min_steps: int = 500
     """Steps of the best trajectories before which nothing is recalled."""
-    every: int | None = None
-    """Environment steps between two turns; by default a rollout, or 500 for an agent that has
-    none (SAC)."""
+    every: int = 500
+    """Environment steps between two turns, or a rollout where that is more."""
     seeds: Literal["value", "reward"] = "value"
     """Traces begin at states of which the critic thinks highest, or that were rewarded most (the
     paper's proxy where there is no critic)."""
@@ -231,3 +231,13 @@ class RecallConfig:
     """Step size of the imitation's Adam."""
     max_kl: float = 0.005
     """Imitation stops where the mean KL of a turn passes this, nats."""
+
+    def problem(self) -> str | None:
+        """What is wrong with these settings, if anything is."""
+        counts = "trace_length traces capacity min_steps every imitation_steps imitation_batch"
+        for name in (*counts.split(), "learning_rate", "max_kl", "top_percent"):
+            if not getattr(self, name) > 0:
+                return f"{name} must be greater than 0, not {getattr(self, name)}"
+        if self.top_percent > 100:
+            return f"top_percent must be at most 100, not {self.top_percent}"
+        return None if self.model_steps >= 0 else "model_steps must be 0 or more"

@@ -145,9 +145,9 @@ def grid(study: Study) -> list[Run]:
 
 def words(run: Run) -> list[str]:
     """The flags of `goalgan_bt.train` for a run."""
-    alone = [] if four_rooms.asked_for(["--env", run.env]) else ["--threads", "1", "--viz", "none"]
-    flags = shlex.split(run.flags)
-    return ["--env", *shlex.split(run.env), "--seed", str(run.seed), *alone, *flags]
+    named = ["--env", *shlex.split(run.env), "--seed", str(run.seed)]
+    alone = [] if four_rooms.asked_for(named) else ["--threads", "1", "--viz", "none"]
+    return [*named, *alone, *shlex.split(run.flags)]
 
 
 def settings(run: Run) -> Any:

@@ -130,11 +130,8 @@ def test_traces_begin_at_the_goal_and_obey_the_world():
     rooms, rng = FourRooms(11), np.random.default_rng(2)
     recall = Recall(rooms, TracesConfig(length=30, number=50), True)
     recall.add(walk_to_goal(rooms, rng))
-    values = rng.uniform(0, 1, len(rooms.cells))
-    seed = recall.seed(values, 0.98)
-    assert seed == rooms.goal  # reaching it is worth 1, and nothing else is worth more
-    states, actions = recall.traces(seed, rng)
-    following = np.concatenate([np.full((1, 50), seed), states[:-1]])
+    states, actions = recall.traces(rng)
+    following = np.concatenate([np.full((1, 50), rooms.goal), states[:-1]])
     np.testing.assert_array_equal(rooms.next_state[states, actions], following)
 
 
@@ -197,6 +194,8 @@ def test_larger_rooms_need_recall_traces(tmp_path):
         (["--discount", "1.5"], "--discount must be between 0 and 1"),
         (["--method", "alphago"], "invalid choice 'alphago' for argument '--method'"),
         (["--traces.depth", "3"], "--traces.depth"),
+        (["--replay.beta", "1000"], "--replay.beta must be between 0 and 1"),
+        (["--horizon", "1000000"], "--horizon must be between 1"),
     ],
 )
 def test_bad_flags_end_in_one_line(flags, words, tmp_path):
@@ -207,7 +206,7 @@ def test_bad_flags_end_in_one_line(flags, words, tmp_path):
 
 def test_a_study_of_rooms(tmp_path):
     text = """
-envs = ["four_rooms_7", "four_rooms_9"]
+envs = ["four_rooms_7", "four_rooms_9 --horizon 100"]
 seeds = 2
 flags = "--total-steps 5000"
 [methods]
@@ -219,7 +218,7 @@ actor_critic = "--method actor_critic"
     done = run_module(*words)
     assert done.returncode == 0, done.stderr
     report = (tmp_path / "out/rooms/README.md").read_text()
-    assert "## four_rooms_9" in report and "recall_traces over actor_critic" in report
+    assert "## four_rooms_9 --horizon 100" in report and "recall_traces over actor_critic" in report
     with pytest.raises(UsageError, match="four_rooms_5"):
         (tmp_path / "bad.toml").write_text(text.replace("four_rooms_7", "four_rooms_5"))
         study.load(str(tmp_path / "bad.toml"))

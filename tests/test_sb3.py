@@ -14,6 +14,7 @@ from stable_baselines3.common.evaluation import evaluate_policy  # noqa: E402
 from stable_baselines3.common.logger import configure  # noqa: E402
 from stable_baselines3.common.vec_env import VecNormalize  # noqa: E402
 
+from goalgan_bt import sb3  # noqa: E402
 from goalgan_bt.sb3 import RecallConfig, RecallTraces, Trajectory  # noqa: E402
 
 FASTEST = np.array([0.2, 0.4], np.float32)
@@ -69,13 +70,15 @@ def test_agents_learn_with_recall_traces(name, steps, good, tmp_path):
     after, _ = evaluate_policy(model, env, 20)
     assert before < RANDOM < good < after, (before, after)
     told = callback.turn()
-    assert told["kl"] <= 0.005 and 0 < told["valid"] <= 1 and np.isfinite(told["lower_bound"])
+    assert told["kl"] <= 0.005 and 0 < told["valid"] <= 1 and np.isfinite(told["log_ratio"])
     assert "recall/threshold" in (tmp_path / "progress.csv").read_text()
 
     model.save(tmp_path / "agent")
     callback.save(tmp_path / "recall.pt")
     model = AGENTS[name].load(tmp_path / "agent", env=env)
-    again = RecallTraces.load(tmp_path / "recall.pt", callback.cfg)
+    again = RecallTraces.load(tmp_path / "recall.pt")
+    assert again.cfg == callback.cfg
+    again.save(tmp_path / "recall.pt")  # also before it has gone on
     assert len(again.trajectories) == len(callback.trajectories)
     model.learn(500, callback=again, reset_num_timesteps=False)
     for a, b in zip(callback.trajectories, again.trajectories, strict=False):
@@ -90,7 +93,8 @@ def test_trajectories_are_what_happened():
     callback = recall()
     agent("PPO", env).learn(1000, callback=callback)
     assert len(callback.trajectories) >= 30
-    for obs, actions, rewards in callback.trajectories:
+    for obs, actions, rewards, terminated in callback.trajectories:
+        assert not terminated
         assert obs.shape == (31, 2) and actions.shape == (30, 2)
         assert np.abs(actions).max() <= 1 + 1e-6
         moved = np.clip(obs[:-1] + actions * FASTEST, -2, 2)
@@ -110,18 +114,19 @@ def test_the_threshold_is_a_percentile_and_the_memory_has_an_end():
     callback = RecallTraces(RecallConfig(top_percent=20, capacity=100))
     for i in range(50):
         path = [(np.zeros(2), np.zeros(2), float(i % 10))] * 5
-        callback._remember(path, np.zeros(2))
+        callback._remember(path, np.zeros(2), False)
     assert sum(len(one.rewards) for one in callback.trajectories) == 100
     chosen, threshold = callback.best()
     assert threshold == 5 * 8 and len(chosen) == 4  # of 20 trajectories those of 8 and 9 a step
     callback.trajectories.clear()
-    callback.trajectories.append(Trajectory(np.zeros((2, 2)), np.zeros((1, 2)), np.ones(1)))
-    assert callback.best()[1] == 1.0
+    same = Trajectory(np.zeros((2, 2)), np.zeros((1, 2)), np.ones(1), True)
+    callback.trajectories.extend([same, same])
+    assert callback.best()[0] == []  # none is better than another
 
 
 @pytest.mark.parametrize("name", ["SAC", "PPO"])
-def test_imitation_moves_the_mean_and_nothing_else(name):
-    """Towards the recalled actions, within the bound on the KL; the std stays."""
+def test_imitation_moves_the_mean(name):
+    """Towards what was recalled, within the bound on the KL; the std stays where it is its own."""
     env = make_vec_env(Reach, n_envs=1, seed=0)
     model, callback = agent(name, env), recall(imitation_steps=50, max_kl=0.05, learning_rate=1e-3)
     model.learn(300, callback=callback)
@@ -140,7 +145,7 @@ def test_imitation_moves_the_mean_and_nothing_else(name):
 
     (mean, std), kl = now(), 0.0
     for _ in range(10):
-        kl = max(kl, callback._imitate(states, towards, states, 40, states)["kl"])
+        kl = max(kl, callback._imitate(states, towards, states, states)["kl"])
     new_mean, new_std = now()
     assert 0 < kl <= 0.05
     gap, new_gap = (np.abs(x - towards).mean() for x in (mean, new_mean))
@@ -173,3 +178,54 @@ def test_learning_goes_on_where_it_was_or_anew():
     model.learn(80, callback=callback)
     assert {len(one.rewards) for one in callback.trajectories} == {30}
     assert len(callback.trajectories) == before + 2
+
+
+@pytest.mark.parametrize("name", ["SAC", "PPO"])
+def test_every_call_of_learn_has_its_turns(name, monkeypatch):
+    callback, turns = recall(every=100), []
+    turn = callback.turn
+    monkeypatch.setattr(callback, "turn", lambda: turns.append(1) or turn())
+    model, counts = agent(name, make_vec_env(Reach, n_envs=2, seed=0)), []
+    for _ in range(3):
+        model.learn(1100, callback=callback)
+        counts.append(len(turns))
+        turns.clear()
+    assert min(counts) >= 2 and max(counts) - min(counts) <= 1
+
+
+def test_the_log_density_is_that_of_the_model():
+    """Against torch's own Gaussian, in units of the actions."""
+    callback = recall()
+    agent("PPO", make_vec_env(Reach, n_envs=2, seed=0), n_steps=512).learn(4096, callback=callback)
+    model = callback.backtracking
+    following, actions = torch.rand(50, 2), 2 * torch.rand(50, 2) - 1
+    with torch.no_grad():
+        mean = model.action_net(model.state_scale.normalise(following))
+    said = torch.distributions.Normal(model.action_scale.restore(mean), model.action_scale.std)
+    found = model.action_log_density(following, actions)
+    torch.testing.assert_close(found, said.log_prob(actions).sum(dim=1), rtol=1e-4, atol=1e-4)
+
+
+def test_traces_begin_where_it_pays_to_be(monkeypatch):
+    """A state that ends an episode is worth its reward, whatever the critic says of it."""
+    callback = recall(traces=1)
+    model = agent("PPO", make_vec_env(Reach, n_envs=1, seed=0))
+    model.learn(256, callback=callback)
+    callback._values = lambda obs: obs[:, 0] * 10  # the critic likes the right
+    begun, unroll = [], sb3.recall_traces
+    monkeypatch.setattr(sb3, "recall_traces", lambda *a: begun.append(a[2][0]) or unroll(*a))
+    callback.trajectories.clear()
+    line = np.linspace(-1, 1, 201)
+    obs = np.column_stack([line, line])
+    for terminated in (True, False):
+        callback.trajectories.append(Trajectory(obs, np.zeros((200, 2)), np.zeros(200), terminated))
+        callback.trajectories.append(Trajectory(obs, np.zeros((200, 2)), -np.ones(200), terminated))
+        callback.turn()
+        callback.trajectories.clear()
+    np.testing.assert_allclose(begun, [obs[-2], obs[-1]])
+
+
+@pytest.mark.parametrize("bad", [{"top_percent": 200}, {"traces": 0}, {"every": -1}])
+def test_settings_that_make_no_sense_are_refused(bad):
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        RecallTraces(RecallConfig(**bad))
