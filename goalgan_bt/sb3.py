@@ -69,6 +69,10 @@ class RecallTraces(BaseCallback):
         seed: of the model and the traces.
         verbose: as of every callback.
 
+    Attributes:
+        trajectories: what is remembered, the newest last; backtracking: the model, once learning
+            has begun; last: what the last turn gave (see `turn`); seconds: what all turns took.
+
     Raises:
         ValueError: for settings that make no sense.
         TypeError: when learning begins, if the agent's policy is no Gaussian (without memory or
@@ -83,10 +87,11 @@ class RecallTraces(BaseCallback):
         self.trajectories: deque[Trajectory] = deque()
         self.backtracking: BacktrackingModel | None = None
         self._rng, self._noise = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
-        self._remembered, self._spent, self._last = 0, 0.0, 0
+        self._remembered, self._turned = 0, 0
         self._moments: dict[str, Any] | None = None  # of a saved optimiser
         self._agent: Any = None  # whose policy the optimiser is for
-        self.last: dict[str, float] = {}  # what the last turn gave
+        self.last: dict[str, float] = {}
+        self.seconds = 0.0
 
     def _model(self, obs_dim: int, act_dim: int) -> BacktrackingModel:
         cfg = BacktrackingConfig(batch=256, steps=self.cfg.model_steps)
@@ -113,7 +118,7 @@ class RecallTraces(BaseCallback):
         if self.backtracking is None:
             self.backtracking = self._model(space.shape[0], actions.shape[0])
         if self._agent is not self.model:
-            self._agent, self._last = self.model, self.model.num_timesteps
+            self._agent, self._turned = self.model, self.model.num_timesteps
             self._optimiser = torch.optim.Adam(self._learner.parameters(), self.cfg.learning_rate)
             self._paths: list[list[tuple[Any, Any, float]]] = [[] for _ in range(self.model.n_envs)]
         if self._moments is not None:
@@ -122,7 +127,7 @@ class RecallTraces(BaseCallback):
 
     def _on_training_start(self) -> None:
         if self.locals["reset_num_timesteps"]:  # then the environments have been reset, too
-            self._last = 0
+            self._turned = 0
             for path in self._paths:
                 path.clear()
 
@@ -155,14 +160,14 @@ class RecallTraces(BaseCallback):
     def _on_rollout_start(self) -> None:
         # The agent has just learned, and what it collects next is collected by the policy as it
         # will be then: the moment to change it.
-        if self.num_timesteps - self._last >= self.cfg.every:
-            self._last = self.num_timesteps
+        if self.num_timesteps - self._turned >= self.cfg.every:
+            self._turned = self.num_timesteps
             begin = time.perf_counter()
             self.last = self.turn()
             for name, value in self.last.items():
                 self.logger.record(f"recall/{name}", value)
-            self._spent += time.perf_counter() - begin
-            self.logger.record("recall/seconds", self._spent)
+            self.seconds += time.perf_counter() - begin
+            self.logger.record("recall/seconds", self.seconds)
 
     def best(self) -> tuple[list[Trajectory], float]:
         """The trajectories whose return is in the top percent, and the lowest of those returns."""
