@@ -89,7 +89,7 @@ def from_command_line(argv: list[str]) -> LocomotionConfig:
     if cfg.seed < 0:
         raise UsageError("--seed must be 0 or more")
     if cfg.backtracking.trace_length and (problem := cfg.backtracking.problem()):
-        raise UsageError(problem)
+        raise UsageError(f"--backtracking: {problem} (a trace_length of 0 is the agent alone)")
     return cfg
 
 

@@ -51,7 +51,7 @@ def test_without_traces_nothing_is_recalled(tmp_path):
     ("flags", "words"),
     [
         (["--total-steps", "0"], "--total-steps must be"),
-        (["--backtracking.trace-length", "-1"], "--backtracking.trace-length must be"),
+        (["--backtracking.trace-length", "-1"], "trace_length must be greater"),
         (["--method", "ppo"], "choose trpo or sac"),
         (["--speed", "9"], "--speed"),
     ],
