@@ -22,7 +22,7 @@ def test_presets_are_the_papers():
         locomotion.from_command_line(["--env", "ant", "--method", "a2c"])
 
 
-@pytest.mark.parametrize(("method", "steps"), [("trpo", 9000), ("sac", 400)])
+@pytest.mark.parametrize(("method", "steps"), [("trpo", 5000), ("sac", 400)])
 def test_a_run_of_the_hopper(method, steps, tmp_path):
     pytest.importorskip("sb3_contrib")
     flags = "--env", "hopper", "--method", method, "--total-steps", steps, "--out", tmp_path
