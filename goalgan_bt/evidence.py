@@ -243,7 +243,7 @@ def _curves(ax: Axes, env: str, of: dict[str, dict[int, Curve]]) -> None:
     for i, (method, seeds) in enumerate(of.items()):
         if not seeds:
             continue
-        grid = np.linspace(0, min(curve.steps[-1] for curve in seeds.values()), 60)
+        grid = np.linspace(0, min(curve.steps[-1] for curve in seeds.values()), 150)
         y = np.array([np.interp(grid, *curve) for curve in seeds.values()])
         bounds = np.array([interval(column) for column in y.T])
         style = _style(i)
