@@ -306,7 +306,11 @@ def load(folder: Path) -> Config:
         ConfigError: if the folder is no run or its settings cannot be read.
     """
     try:
-        cfg = _build(Config, json.loads((folder / "config.json").read_text()))
+        values = json.loads((folder / "config.json").read_text())
+        if isinstance(values, dict) and {"replay", "episodes"} & set(values):
+            env = values.get("env")
+            raise ValueError(f"runs of {env} leave no checkpoint to go on from: start again")
+        cfg = _build(Config, values)
         check(cfg)
         return cfg
     except FileNotFoundError:

@@ -167,6 +167,11 @@ def test_a_run_from_its_flags_to_its_figures(tmp_path):
     with np.load(folder / "visits.npz") as visits:
         assert visits["training"].shape == (11, 11) and visits["trained"][1, 1] >= 50
         assert np.nansum(visits["training"]) == int(rows[-1]["steps/train"])
+    for words in (["train", "--resume", folder], ["viz", folder, "--export", tmp_path / "x.html"]):
+        refused = run_module(*words)
+        assert refused.returncode == 2 and refused.stderr.count("\n") == 1
+    picture = run_module("plot", folder, "--out", tmp_path.parent / f"{tmp_path.name}.png")
+    assert picture.returncode == 0, picture.stderr
     again = train("--out", tmp_path / "again", "--seed", 3)
     assert again.returncode == 0
     (other,) = (tmp_path / "again").iterdir()
