@@ -65,7 +65,10 @@ def row(env: str, method: str, runs: list[dict[str, np.ndarray]]) -> dict[str, s
     }
 
 
-def draw(found: dict[tuple[str, str], list[dict[str, np.ndarray]]]) -> Figure:
+def draw(
+    found: dict[tuple[str, str], list[dict[str, np.ndarray]]],
+    rows: dict[tuple[str, str], dict[str, str]],
+) -> Figure:
     """A map of the trained policy's visits for each method and size, on one logarithmic scale."""
     envs = sorted({env for env, _ in found})
     methods = sorted({method for _, method in found})
@@ -79,7 +82,7 @@ def draw(found: dict[tuple[str, str], list[dict[str, np.ndarray]]]) -> Figure:
                 continue
             counts = np.mean([run["trained"] for run in found[env, method]], axis=0)
             image = ax.imshow(counts, cmap="viridis", norm=LogNorm(0.1, 100, clip=True))
-            known = row(env, method, found[env, method])
+            known = rows[env, method]
             ax.set_title(f"{env[11:]}: {known['trained']} of {known['free']} cells", fontsize=9)
             if j == 0:
                 ax.set_ylabel(method)
@@ -93,17 +96,17 @@ def main() -> int:
         settings = parse(Settings, None, "python benchmarks/visits.py")
         found = visits(settings.runs)
         settings.out.mkdir(parents=True, exist_ok=True)
-        rows = [row(*key, found[key]) for key in sorted(found)]
-        record.write_table(settings.out / "visits.csv", COLUMNS, rows)
+        rows = {key: row(*key, found[key]) for key in sorted(found)}
+        record.write_table(settings.out / "visits.csv", COLUMNS, list(rows.values()))
         picture = io.BytesIO()
-        draw(found).savefig(picture, dpi=110)
+        draw(found, rows).savefig(picture, dpi=110)
         (settings.out / "visits.png").write_bytes(picture.getvalue())
     except (UsageError, record.RunError, OSError) as error:
         complain(str(error))
         return 2
     writer = csv.DictWriter(sys.stdout, COLUMNS, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    writer.writerows(rows.values())
     say(str(settings.out / "visits.png"))
     return 0
 

@@ -3,22 +3,24 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
-from goalgan_bt.learner import Learner
 from goalgan_bt.policy import GaussianPolicy
 from goalgan_bt.record import RunError, write_atomically
 
+if TYPE_CHECKING:
+    from goalgan_bt.learner import Learner
 
-def save(learner: Learner, folder: Path) -> None:
+
+def save(learner: "Learner", folder: Path) -> None:
     """Write `checkpoint.pt`; the old one stays in place until the new one is complete."""
     state = learner.state_dict()
     write_atomically(folder / "checkpoint.pt", lambda file: torch.save(state, file))
 
 
-def load(learner: Learner, folder: Path) -> None:
+def load(learner: "Learner", folder: Path) -> None:
     """Put a run's `checkpoint.pt` into a learner of the same settings.
 
     Raises:
@@ -41,6 +43,15 @@ def load_policy(policy: GaussianPolicy, folder: Path) -> int:
         policy.load_state_dict(state["modules"]["policy"])
         iteration = int(state["iteration"])
     return iteration
+
+
+def restore(module: Any, state: dict[str, Any]) -> None:
+    """Put a state into a network or an optimiser; the latter keeps its learning rate, which a run
+    that goes on may have changed."""
+    rates = [group["lr"] for group in getattr(module, "param_groups", [])]
+    module.load_state_dict(state)
+    for group, rate in zip(getattr(module, "param_groups", []), rates, strict=True):
+        group["lr"] = rate
 
 
 @contextmanager

@@ -7,6 +7,7 @@ import re
 import signal
 import sys
 from collections.abc import Callable
+from operator import attrgetter
 from typing import Any, TypeVar
 
 import tyro
@@ -44,6 +45,26 @@ def parse(kind: type[T], argv: list[str] | None, prog: str, default: T | None = 
             sys.stdout.write(printed.getvalue())
             raise
         raise UsageError(_one_line(printed.getvalue())) from None
+
+
+def fault(cfg: Any, names: str, good: Callable[[Any], bool], what: str) -> str | None:
+    """What is wrong with the first of some settings that is not good; None if all are.
+
+    Args:
+        cfg: the settings.
+        names: which of them, as attributes with dots; their values are numbers, tuples of them, or
+            None, which is always good.
+        good: whether a number is.
+        what: the words for it.
+    """
+    for name in names.split():
+        value, flag = attrgetter(name)(cfg), "--" + name.replace("_", "-")
+        for x in value if isinstance(value, tuple) else (value,):
+            if x is not None and not isinstance(x, (int, float)):
+                return f"{flag} must be a number, not {x!r}"
+            if x is not None and not good(x):
+                return f"{flag} must be {what}, not {x}"
+    return None
 
 
 def exit_code(work: Callable[[], None]) -> int:

@@ -8,10 +8,11 @@ import types
 import typing
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Literal
 
-from goalgan_bt import envs
-from goalgan_bt.command_line import UsageError, parse, value_of
+from goalgan_bt import envs, four_rooms, locomotion
+from goalgan_bt.command_line import UsageError, fault, parse, value_of
 from goalgan_bt.methods import METHODS
 from goalgan_bt.record import write_settings
 from goalgan_bt.settings import (
@@ -155,8 +156,7 @@ def preset(env: str) -> Config:
         ConfigError: if there is no such environment.
     """
     if env not in envs.NAMES:
-        others = ", four_rooms_N, half_cheetah, ant, walker2d, hopper, humanoid"
-        names = ", ".join(envs.NAMES) + others
+        names = ", ".join([*envs.NAMES, "four_rooms_N", *locomotion.TASKS])
         raise ConfigError(f"unknown environment {env!r}: choose one of {names}")
     cfg = replace(ANT if env.startswith("ant") else POINT, env=env)
     if env == "point_nd":
@@ -215,20 +215,14 @@ def check(cfg: Config) -> None:
         (not_negative, lambda x: x >= 0, "0 or more"),
         (shares, lambda x: 0 <= x <= 1, "between 0 and 1"),
         (f"{above_zero} {not_negative}", lambda x: x <= 1e12 or x == math.inf, "a sane number"),
+        (
+            f"{above_zero} {not_negative}".replace("goals.near", ""),
+            lambda x: x < math.inf,
+            "finite",
+        ),
     ):
-        for name in names.split():
-            value: Any = cfg
-            for part in name.split("."):
-                value = getattr(value, part)
-            parts = value if isinstance(value, tuple) else (value,)
-            flag = "--" + name.replace("_", "-")
-            for x in parts:
-                if x is not None and not isinstance(x, (int, float)):
-                    raise ConfigError(f"{flag} must be a number, not {x!r}")
-                if x is not None and not good(x):
-                    raise ConfigError(f"{flag} must be {what}, not {x}")
-                if x == math.inf and name != "goals.near":
-                    raise ConfigError(f"{flag} must be finite")
+        if bad := fault(cfg, names, good, what):
+            raise ConfigError(bad)
     most = 8 * len(os.sched_getaffinity(0))
     if cfg.threads > most:
         raise ConfigError(f"--threads must be at most {most} on this machine, not {cfg.threads}")
@@ -264,6 +258,13 @@ def check(cfg: Config) -> None:
         )
     if cfg.goals.r_min >= cfg.goals.r_max:
         raise ConfigError("--goals.r-min must be less than --goals.r-max")
+
+
+def other_learner(argv: list[str]) -> ModuleType | None:
+    """The learner, with settings of its own, of the environment that a command line names, unless
+    it is one of those that this module knows."""
+    others = four_rooms, locomotion
+    return next((other for other in others if other.asked_for(argv)), None)
 
 
 def from_command_line(argv: list[str] | None = None) -> Config:
@@ -307,8 +308,7 @@ def load(folder: Path) -> Config:
     """
     try:
         values = json.loads((folder / "config.json").read_text())
-        if isinstance(values, dict) and {"replay", "episodes"} & set(values):
-            env = values.get("env")
+        if isinstance(values, dict) and other_learner(["--env", str(env := values.get("env"))]):
             raise ValueError(f"runs of {env} leave no checkpoint to go on from: start again")
         cfg = _build(Config, values)
         check(cfg)

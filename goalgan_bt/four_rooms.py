@@ -11,7 +11,6 @@ import re
 import sys
 import time
 from dataclasses import asdict, dataclass, field, replace
-from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -19,10 +18,11 @@ import numpy as np
 
 from goalgan_bt import record
 from goalgan_bt.advantage import gae
-from goalgan_bt.command_line import UsageError, exit_code, parse, value_of
+from goalgan_bt.command_line import UsageError, exit_code, fault, parse, value_of
 from goalgan_bt.envs.four_rooms import SIZES, FourRooms, Ints
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.progress import say
+from goalgan_bt.record import Record
 
 NAME = re.compile(r"four_rooms_(\d{1,2})")
 FAINT = 0.01  # times that each possible action counts as seen, so that none is impossible
@@ -335,7 +335,7 @@ def train(cfg: FourRoomsConfig, folder: Path) -> Measured:
     walkers = Walkers(rooms, cfg.num_envs, cfg.horizon)
     replay = Prioritised(cfg.replay)
     recall = Recall(rooms, cfg.traces, learned=cfg.method != "random_model")
-    rows: list[dict[str, str]] = []
+    records = Record(folder, events=False)  # which would import torch, for longer than the run
     began, steps, tested, update, next_report = time.perf_counter(), 0, 0, 0, 0.0
     visited = np.zeros(len(rooms.cells), dtype=np.int64)
     while steps < cfg.total_steps:
@@ -374,7 +374,7 @@ def train(cfg: FourRoomsConfig, folder: Path) -> Measured:
             measured = measure(rooms, learner, cfg, test_rng)
             tested += measured.steps
             seconds = time.perf_counter() - began
-            row = {
+            row: dict[str, float] = {
                 "iteration": update,
                 "steps/train": steps,
                 "steps/label": 0,
@@ -386,12 +386,11 @@ def train(cfg: FourRoomsConfig, folder: Path) -> Measured:
                 "eval/states": int((measured.visits > 0).sum()),
                 "train/states": int((visited > 0).sum()),
             }
-            rows.append({name: str(value) for name, value in row.items()})
-            record.write_table(folder / "metrics.csv", list(row), rows)
+            records.metrics(row)
     grids = {"training": visited, "trained": measured.visits}
     pictures: dict[str, Any] = {name: rooms.picture(visits) for name, visits in grids.items()}
     record.write_atomically(folder / "visits.npz", lambda file: np.savez(file, **pictures))
-    (folder / record.ENDED).write_text("complete\n")
+    records.close("complete")
     return measured
 
 
@@ -433,17 +432,14 @@ def from_command_line(argv: list[str]) -> FourRoomsConfig:
     """
     default = preset(value_of(argv, "--env") or FourRoomsConfig.env)
     cfg = parse(FourRoomsConfig, argv, "python -m goalgan_bt.train", default)
-    for names, low, high in (
-        (COUNTS, 1, 10**9),
-        (SIZES_OF_TABLES, 1, 10**5),
-        (RATES, 0, 10**9),
-        (SHARES, 0, 1),
+    for names, good, what in (
+        (COUNTS, lambda x: 1 <= x <= 10**9, "between 1 and 1000000000"),
+        (SIZES_OF_TABLES, lambda x: 1 <= x <= 10**5, "between 1 and 100000"),
+        (RATES, lambda x: 0 <= x <= 10**9, "between 0 and 1000000000"),
+        (SHARES, lambda x: 0 <= x <= 1, "between 0 and 1"),
     ):
-        for name in names.split():
-            value = attrgetter(name)(cfg)
-            if not low <= value <= high:
-                flag = "--" + name.replace("_", "-")
-                raise UsageError(f"{flag} must be between {low} and {high}, not {value}")
+        if bad := fault(cfg, names, good, what):
+            raise UsageError(bad)
     return cfg
 
 
@@ -452,9 +448,7 @@ def main() -> int:
 
     def work() -> None:
         cfg = from_command_line(sys.argv[1:])
-        folder = record.create_folder(cfg.out, cfg.env, cfg.seed)
-        record.write_meta(folder, None)
-        record.write_settings(folder, asdict(cfg))
+        folder = record.new_run(cfg.out, cfg.env, cfg.seed, asdict(cfg))
         say(f"run folder: {folder}")
         measured = train(cfg, folder)
         seen = int((measured.visits > 0).sum())

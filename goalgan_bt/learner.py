@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from goalgan_bt.backtracking import BacktrackingModel, Transitions
+from goalgan_bt.checkpoint import restore
 from goalgan_bt.config import Config
 from goalgan_bt.envs.batch import GoalEnv
 from goalgan_bt.envs.maze import BoolArray, FloatArray
@@ -198,11 +199,7 @@ class Learner:
                 sizes.
         """
         for name, module in self._modules().items():
-            groups = getattr(module, "param_groups", [])
-            rates = [group["lr"] for group in groups]
-            module.load_state_dict(state["modules"][name])
-            for group, rate in zip(getattr(module, "param_groups", []), rates, strict=True):
-                group["lr"] = rate  # the settings' learning rate, which a resumed run may change
+            restore(module, state["modules"][name])
         self.iteration = int(state["iteration"])
         self.steps = {name: int(state["steps"][name]) for name in self.steps}
         self.seconds = float(state["seconds"])

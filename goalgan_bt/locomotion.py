@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from goalgan_bt import record
-from goalgan_bt.command_line import UsageError, exit_code, parse, value_of
+from goalgan_bt.command_line import UsageError, exit_code, fault, parse, value_of
 from goalgan_bt.progress import say
+from goalgan_bt.record import Record
 from goalgan_bt.settings import RecallConfig
 
 TASKS = {
@@ -83,11 +84,12 @@ def from_command_line(argv: list[str]) -> LocomotionConfig:
     """
     default = preset(value_of(argv, "--env") or "hopper", value_of(argv, "--method") or "trpo")
     cfg = parse(LocomotionConfig, argv, "python -m goalgan_bt.train", default)
-    for name in ("total_steps", "num_envs", "episodes"):
-        if getattr(cfg, name) < 1:
-            raise UsageError(f"--{name.replace('_', '-')} must be 1 or more")
-    if cfg.seed < 0:
-        raise UsageError("--seed must be 0 or more")
+    for names, good, what in (
+        ("total_steps num_envs episodes", lambda x: x >= 1, "1 or more"),
+        ("seed", lambda x: x >= 0, "0 or more"),
+    ):
+        if bad := fault(cfg, names, good, what):
+            raise UsageError(bad)
     if cfg.backtracking.trace_length and (problem := cfg.backtracking.problem()):
         raise UsageError(f"--backtracking: {problem} (a trace_length of 0 is the agent alone)")
     return cfg
@@ -129,10 +131,11 @@ def train(cfg: LocomotionConfig, folder: Path) -> float:
     traced = cfg.backtracking.trace_length > 0
     recall = RecallTraces(cfg.backtracking, cfg.seed) if traced else None
 
-    rows: list[dict[str, str]] = []
-    began, tested, mean = time.perf_counter(), 0, float("nan")
+    records = Record(folder)
+    began, tested, reports, mean = time.perf_counter(), 0, 0, float("nan")
     while agent.num_timesteps < cfg.total_steps:
-        wanted = cfg.total_steps * (len(rows) + 1) // REPORTS - agent.num_timesteps
+        reports += 1
+        wanted = cfg.total_steps * reports // REPORTS - agent.num_timesteps
         agent.learn(max(1, wanted), callback=recall, reset_num_timesteps=False)
         if cfg.method == "trpo":
             sync_envs_normalization(env, test_env)
@@ -140,8 +143,8 @@ def train(cfg: LocomotionConfig, folder: Path) -> float:
         returns, lengths = found
         tested, mean = tested + sum(lengths), sum(returns) / len(returns)
         seconds = time.perf_counter() - began
-        row = {
-            "iteration": len(rows) + 1,
+        row: dict[str, float] = {
+            "iteration": reports,
             "steps/train": agent.num_timesteps,
             "steps/label": 0,
             "steps/eval": tested,
@@ -150,15 +153,13 @@ def train(cfg: LocomotionConfig, folder: Path) -> float:
             "eval/return": round(mean, 2),
         }
         if recall is not None:
-            row |= {f"recall/{name}": round(value, 6) for name, value in recall.last.items()}
-        rows.append({name: str(value) for name, value in row.items()})
-        columns = list(dict.fromkeys(name for one in rows for name in one))
-        record.write_table(folder / "metrics.csv", columns, rows)
+            row |= {f"recall/{name}": value for name, value in recall.last.items()}
+        records.metrics(row)
         left = seconds * max(0.0, cfg.total_steps / agent.num_timesteps - 1)
         say(f"steps {agent.num_timesteps:,}  return {mean:.1f}  left {left / 60:.0f} min")
     state = agent.policy.state_dict()
     record.write_atomically(folder / "policy.pt", lambda file: torch.save(state, file))
-    (folder / record.ENDED).write_text("complete\n")
+    records.close("complete")
     return mean
 
 
@@ -167,9 +168,7 @@ def main() -> int:
 
     def work() -> None:
         cfg = from_command_line(sys.argv[1:])
-        folder = record.create_folder(cfg.out, cfg.env, cfg.seed)
-        record.write_meta(folder, None)
-        record.write_settings(folder, asdict(cfg))
+        folder = record.new_run(cfg.out, cfg.env, cfg.seed, asdict(cfg))
         say(f"run folder: {folder}")
         found = train(cfg, folder)
         say(f"return {found:.1f} after {cfg.total_steps:,} training steps: {folder}")

@@ -54,6 +54,16 @@ def create_folder(out: Path, env: str, seed: int) -> Path:
     raise RunError(f"cannot make a run folder in {out} ({reason}): choose another with --out")
 
 
+def new_run(
+    out: Path, env: str, seed: int, settings: dict[str, Any], maze: Maze | None = None
+) -> Path:
+    """A new run folder in `out` with its `meta.json` and `config.json`."""
+    folder = create_folder(out, env, seed)
+    write_meta(folder, maze)
+    write_settings(folder, settings)
+    return folder
+
+
 def write_meta(folder: Path, maze: Maze | None) -> None:
     """Write what is needed to know and to draw this run to `meta.json`."""
     commit = subprocess.run(
@@ -92,9 +102,10 @@ class Record:
     Args:
         folder: the run folder.
         iteration: rows after this one are dropped, for a run that is taken up again.
+        events: whether TensorBoard gets the metrics too, if it is installed.
     """
 
-    def __init__(self, folder: Path, iteration: int = 0) -> None:
+    def __init__(self, folder: Path, iteration: int = 0, events: bool = True) -> None:
         self.folder = folder
         self._lock = (folder / "lock").open("w")
         try:
@@ -112,7 +123,8 @@ class Record:
         for frame in frames(folder):
             if int(frame.stem) > iteration:
                 frame.unlink()
-        self._events = _tensorboard(folder, int(self._rows[-1]["steps/train"]) if self._rows else 0)
+        known = int(self._rows[-1]["steps/train"]) if self._rows else 0
+        self._events = _tensorboard(folder, known) if events else None
 
     def metrics(self, row: dict[str, float]) -> None:
         """Append a row; a value that is missing or NaN is an empty cell."""

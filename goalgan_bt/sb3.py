@@ -25,6 +25,7 @@ from torch import Tensor
 from torch.distributions import Normal, kl_divergence
 
 from goalgan_bt.backtracking import BacktrackingModel, Transitions, recall_traces
+from goalgan_bt.checkpoint import restore
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.settings import BacktrackingConfig, RecallConfig
 
@@ -111,9 +112,7 @@ class RecallTraces(BaseCallback):
         if not (isinstance(actions, spaces.Box) and len(actions.shape) == 1):
             raise TypeError(f"RecallTraces needs actions that are vectors of numbers: {actions}")
         self._squashed = isinstance(policy, SACPolicy)
-        self._learner: Any = self.model.policy
-        if self._squashed:
-            self._learner = policy.actor
+        self._learner = policy.actor if self._squashed else policy
         self._low, self._high = actions.low.astype(float), actions.high.astype(float)
         if self.backtracking is None:
             self.backtracking = self._model(space.shape[0], actions.shape[0])
@@ -122,7 +121,7 @@ class RecallTraces(BaseCallback):
             self._optimiser = torch.optim.Adam(self._learner.parameters(), self.cfg.learning_rate)
             self._paths: list[list[tuple[Any, Any, float]]] = [[] for _ in range(self.model.n_envs)]
         if self._moments is not None:
-            _restore(self._optimiser, self._moments)
+            restore(self._optimiser, self._moments)
             self._moments = None
 
     def _on_training_start(self) -> None:
@@ -340,14 +339,6 @@ class RecallTraces(BaseCallback):
         first = callback.trajectories[0]
         callback.backtracking = callback._model(first.obs.shape[1], first.actions.shape[1])
         callback.backtracking.load_state_dict(state["model"])
-        _restore(callback.backtracking.optimiser, state["model_optimiser"])
+        restore(callback.backtracking.optimiser, state["model_optimiser"])
         callback._moments = state["optimiser"]
         return callback
-
-
-def _restore(optimiser: torch.optim.Optimizer, state: dict[str, Any]) -> None:
-    """Take over what an optimiser remembers, but not its learning rate."""
-    rates = [group["lr"] for group in optimiser.param_groups]
-    optimiser.load_state_dict(state)
-    for group, rate in zip(optimiser.param_groups, rates, strict=True):
-        group["lr"] = rate

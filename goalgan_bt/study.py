@@ -30,7 +30,7 @@ from typing import Any, Literal, NamedTuple
 
 import tyro
 
-from goalgan_bt import config, four_rooms, record
+from goalgan_bt import config, locomotion, record
 from goalgan_bt.command_line import UsageError, parse
 from goalgan_bt.progress import complain, say
 
@@ -124,8 +124,8 @@ def load(name: str) -> Study:
     study = Study(path.stem, table["envs"], table["methods"], seeds, flags)
     for run in grid(study._replace(seeds=seeds[:1])):
         try:
-            flags = shlex.split(f"{run.env} {run.flags}")
-            if given := {word.split("=")[0] for word in flags} & OURS:
+            given = {word.split("=")[0] for word in shlex.split(f"{run.env} {run.flags}")}
+            if given := given & OURS:
                 raise UsageError(f"{given.pop()} is the study's own")
             settings(run)
         except ValueError as error:  # UsageError is one
@@ -146,7 +146,7 @@ def grid(study: Study) -> list[Run]:
 def words(run: Run) -> list[str]:
     """The flags of `goalgan_bt.train` for a run."""
     named = ["--env", *shlex.split(run.env), "--seed", str(run.seed)]
-    alone = [] if four_rooms.asked_for(named) else ["--threads", "1", "--viz", "none"]
+    alone = [] if config.other_learner(named) else ["--threads", "1", "--viz", "none"]
     return [*named, *alone, *shlex.split(run.flags)]
 
 
@@ -157,8 +157,10 @@ def settings(run: Run) -> Any:
         UsageError: for bad ones.
     """
     asked = words(run)
-    kind = four_rooms if four_rooms.asked_for(asked) else config
-    return kind.from_command_line(asked)
+    other = config.other_learner(asked)
+    if other is locomotion:
+        raise UsageError("studies compare coverage, and locomotion has none: train it run by run")
+    return (other or config).from_command_line(asked)
 
 
 def perform(run: Run, folder: Path) -> Path:

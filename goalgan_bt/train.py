@@ -18,14 +18,11 @@ if __name__ == "__main__":
 
     signal.signal(signal.SIGINT, _leave)
     signal.signal(signal.SIGTERM, _leave)
-    from goalgan_bt import four_rooms, locomotion
+    from goalgan_bt import command_line, config
 
-    for other in (four_rooms, locomotion):  # learners that need none of what follows
-        if other.asked_for(sys.argv):
-            sys.exit(other.main())
+    if other := config.other_learner(sys.argv):  # it needs none of what follows
+        sys.exit(other.main())
     if {"-h", "--help"} & set(sys.argv):
-        from goalgan_bt import command_line, config
-
         try:
             config.from_command_line()  # ends here
         except command_line.UsageError as error:
@@ -34,6 +31,7 @@ if __name__ == "__main__":
 
 import errno
 import math
+from dataclasses import asdict
 from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
@@ -42,7 +40,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from goalgan_bt import checkpoint, config, envs, four_rooms, locomotion, ranks, record, trpo
+from goalgan_bt import checkpoint, config, envs, ranks, record, trpo
 from goalgan_bt.advantage import gae
 from goalgan_bt.backtracking import RecallTraces, Steps, consistency, recall_traces
 from goalgan_bt.beside import Beside, group
@@ -423,10 +421,9 @@ def main() -> int:
             ranks.begin()
             if ranks.rank() == 0:
                 env = make_env(cfg, 1)
-                folder = cfg.resume or record.create_folder(cfg.out, env.name, cfg.seed)
-                if cfg.resume is None:
-                    record.write_meta(folder, env.maze)
-                    config.save(cfg, folder)  # the page reads it before training begins
+                # With its settings: the page reads them before training begins.
+                begin = cfg.out, env.name, cfg.seed, asdict(cfg), env.maze
+                folder = cfg.resume or record.new_run(*begin)
                 say(f"run folder: {folder}")
                 if cfg.viz == "browser":
                     page = Page(folder, cfg.viz_host, cfg.viz_port)
@@ -480,8 +477,8 @@ def how_to_go_on(folder: Path | None) -> str:
 
 def script() -> None:
     """Entry point of the `goalgan-bt` command."""
-    others = [other.main for other in (four_rooms, locomotion) if other.asked_for(sys.argv)]
-    sys.exit((others or [main])[0]())
+    other = config.other_learner(sys.argv)
+    sys.exit(other.main() if other else main())
 
 
 if __name__ == "__main__":
