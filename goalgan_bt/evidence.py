@@ -25,7 +25,7 @@ from goalgan_bt.viz.published import published
 THRESHOLDS = (0.3, 0.48, 0.63, 0.9)  # coverage; 0.48 and 0.63 are Goyal et al. 2019's
 # Whom times are compared with: all methods with the first of these, those with traces with the
 # others; where a study has none of them, all with its own first method.
-REFERENCES = ("goal_gan", "actor_critic", "per", "self_imitation", "hindsight")
+REFERENCES = ("goal_gan", "actor_critic", "per", "self_imitation", "hindsight", "trpo", "sac")
 RESAMPLES = 5000
 
 TIMES = """\
@@ -39,11 +39,18 @@ until coverage first reaches 0.63, on lines between reports; runs that never do 
 Steps (millions) and wall time (with one simulation thread) are means per run."""
 
 
+DIFFERENCES = """Difference to another method, paired by seed: mean and 95% interval (Student's)."""
+RETURN_NOTES = """Interquartile means over seeds with 95% percentile bootstrap intervals (with three seeds they reach
+from the lowest to the highest). `area`: mean return over the run, from the first report on. Steps
+(millions) and wall time (with one thread) are means per run."""
+
+
 class Curve(NamedTuple):
-    """One run: steps (n,) of training, coverage (n,) measured there; both begin with 0."""
+    """One run: steps (n,) of training, values (n,) measured there: coverage, beginning with 0 at 0,
+    or return."""
 
     steps: FloatArray
-    coverage: FloatArray
+    values: FloatArray
 
 
 class Interval(NamedTuple):
@@ -54,7 +61,8 @@ class Interval(NamedTuple):
     high: float
 
     def __str__(self) -> str:
-        return f"{self.value:.2f} [{self.low:.2f}, {self.high:.2f}]"
+        digits = 2 if abs(self.value) < 10 else 0  # of a coverage, of a return
+        return f"{self.value:.{digits}f} [{self.low:.{digits}f}, {self.high:.{digits}f}]"
 
 
 def iqm(x: FloatArray, axis: int = 0) -> NDArray[np.float64]:
@@ -74,22 +82,29 @@ def interval(x: FloatArray) -> Interval:
 
 def time_to(curve: Curve, threshold: float) -> float:
     """Steps at which the line through the reports first reaches a coverage; infinite if never."""
-    above = np.flatnonzero(curve.coverage >= threshold)
+    above = np.flatnonzero(curve.values >= threshold)
     if len(above) == 0:
         return np.inf
     i = max(1, above[0])
-    (x0, x1), (y0, y1) = curve.steps[i - 1 : i + 1], curve.coverage[i - 1 : i + 1]
+    (x0, x1), (y0, y1) = curve.steps[i - 1 : i + 1], curve.values[i - 1 : i + 1]
     return float(x0 + (x1 - x0) * (threshold - y0) / (y1 - y0))
 
 
 def area(curve: Curve) -> float:
-    """Mean coverage over the run."""
-    return float(np.trapezoid(curve.coverage, curve.steps) / curve.steps[-1])
+    """Mean coverage or return over the run."""
+    if len(curve.steps) == 1:
+        return float(curve.values[0])
+    return float(np.trapezoid(curve.values, curve.steps) / (curve.steps[-1] - curve.steps[0]))
 
 
 def areas(seeds: dict[int, Curve]) -> FloatArray:
-    """Mean coverage of each run of a method, (n,)."""
+    """The area of each run of a method, (n,)."""
     return np.array([area(curve) for curve in seeds.values()])
+
+
+def ends(seeds: dict[int, Curve]) -> FloatArray:
+    """What each run of a method measured last, (n,)."""
+    return np.array([curve.values[-1] for curve in seeds.values()])
 
 
 class Ratio(NamedTuple):
@@ -115,11 +130,16 @@ def ratio(ours: list[Curve], theirs: list[Curve], threshold: float) -> Ratio:
     pairs = [[time_to(curve, threshold) for curve in curves] for curves in (ours, theirs)]
     most = [[curve.steps[-1] for curve in curves] for curves in (ours, theirs)]
     of_ours, of_theirs = np.log(np.minimum(pairs, most))
-    logs = of_ours - of_theirs
-    n, mean = len(logs), logs.mean()
-    half = stats.t.ppf(0.975, n - 1) * logs.std(ddof=1) / np.sqrt(n) if n > 1 else np.nan
+    logs = paired(of_ours - of_theirs)
     a, b = (int(np.isfinite(times).sum()) for times in pairs)
-    return Ratio(Interval(*np.exp([mean, mean - half, mean + half])), (a, b), n)
+    return Ratio(Interval(*np.exp(logs)), (a, b), len(ours))
+
+
+def paired(differences: FloatArray) -> Interval:
+    """Mean of paired differences (n,) and Student's interval; NaN bounds for a single one."""
+    n, mean = len(differences), differences.mean()
+    half = stats.t.ppf(0.975, n - 1) * differences.std(ddof=1) / np.sqrt(n) if n > 1 else np.nan
+    return Interval(float(mean), float(mean - half), float(mean + half))
 
 
 def curves(tables: Tables) -> dict[tuple[str, str], dict[int, Curve]]:
@@ -127,7 +147,9 @@ def curves(tables: Tables) -> dict[tuple[str, str], dict[int, Curve]]:
     points: dict[tuple[str, str, int], list[tuple[float, float]]] = {}
     for row in tables.curves:
         key = row["env"], row["method"], int(row["seed"])
-        points.setdefault(key, [(0.0, 0.0)]).append((float(row["steps"]), float(row["coverage"])))
+        begin = [(0.0, 0.0)] if tables.measure == "coverage" else []
+        point = float(row["steps"]), float(row[tables.measure])
+        points.setdefault(key, begin).append(point)
     runs: dict[tuple[str, str], dict[int, Curve]] = {}
     for (env, method, seed), rows in sorted(points.items()):
         runs.setdefault((env, method), {})[seed] = Curve(*np.array(rows).T)
@@ -148,20 +170,21 @@ def report(study: Study, tables: Tables) -> None:
         rows += here.values()
         best_first = sorted(here, key=lambda method: -iqm(areas(of[method])))
         table = _markdown([here[method] for method in best_first])
-        text += ["", f"## {env}", "", *table, "", *_ratios(of)]
+        compared = _ratios(of) if study.measure == "coverage" else _differences(of)
+        text += ["", f"## {env}", "", *table, "", *compared]
     commits = sorted({row["commit"][:12] for row in tables.costs})
     text += [
         "",
-        *NOTES.splitlines(),
+        *(NOTES if study.measure == "coverage" else RETURN_NOTES).splitlines(),
         f"Raw figures: runs.csv, costs.csv. Commit: {', '.join(commits)}.",
         "",
-        "![coverage over training steps](curves.png)",
+        f"![{study.measure} over training steps](curves.png)",
         "",
     ]
     record.write_table(tables.folder / "summary.csv", list(rows[0]), rows)
     (tables.folder / "README.md").write_text("\n".join(text))
     picture = io.BytesIO()
-    draw(envs, runs, list(study.methods)).savefig(picture, dpi=130)
+    draw(study._replace(envs=envs), runs).savefig(picture, dpi=130)
     record.write_atomically(
         tables.folder / "curves.png", lambda file: file.write(picture.getvalue())
     )
@@ -175,9 +198,9 @@ def _row(env: str, method: str, seeds: dict[int, Curve], tables: Tables) -> dict
         "method": method,
         "seeds": str(len(of)),
         "area": str(interval(areas(seeds))),
-        "at the end": str(interval(np.array([curve.coverage[-1] for curve in of]))),
+        "at the end": str(interval(ends(seeds))),
     }
-    for threshold in THRESHOLDS:
+    for threshold in THRESHOLDS if tables.measure == "coverage" else ():
         median = np.median([time_to(curve, threshold) for curve in of]) / 1e6
         digits = 2 if median >= 0.1 else 3  # a grid world takes thousands of steps, not millions
         row[f"to {threshold:g}"] = f"{median:.{digits}f}" if np.isfinite(median) else "-"
@@ -219,18 +242,33 @@ def _ratios(of: dict[str, dict[int, Curve]]) -> list[str]:
     ]
 
 
-def draw(
-    envs: list[str], runs: dict[tuple[str, str], dict[int, Curve]], methods: list[str]
-) -> Figure:
-    """Coverage over training steps, a panel per environment; where there are more than two, also
-    coverage at the end over environments."""
-    panels = len(envs) + (len(envs) > 2)
+def _differences(of: dict[str, dict[int, Curve]]) -> list[str]:
+    reference = next((method for method in REFERENCES if method in of), next(iter(of)))
+    lines = []
+    for method in of:
+        if method == reference or not (seeds := sorted(set(of[method]) & set(of[reference]))):
+            continue
+        ours, theirs = ({seed: of[name][seed] for seed in seeds} for name in (method, reference))
+        cells = [paired(figure(ours) - figure(theirs)) for figure in (areas, ends)]
+        lines.append(f"| {method} less {reference} | {len(seeds)} | {cells[0]} | {cells[1]} |")
+    if not lines:
+        return []
+    heads = ["| difference | seeds | area | at the end |", "| --- | --- | --- | --- |"]
+    return [*DIFFERENCES.splitlines(), "", *heads, *lines]
+
+
+def draw(study: Study, runs: dict[tuple[str, str], dict[int, Curve]]) -> Figure:
+    """Coverage or return over training steps, a panel per environment; where more than two have a
+    coverage, also that at the end over environments."""
+    envs, methods = study.envs, list(study.methods)
+    panels = len(envs) + (len(envs) > 2 and study.measure == "coverage")
     across = min(panels, 2)
     down = math.ceil(panels / across)
     figure = Figure(figsize=(8.5 * across, 5 * down), layout="constrained")
     axes = figure.subplots(down, across, squeeze=False).flat
     for ax, env in zip(axes, envs, strict=False):
-        _curves(ax, env, {method: runs.get((env, method), {}) for method in methods})
+        of = {method: runs.get((env, method), {}) for method in methods}
+        _curves(ax, env, of, study.measure)
     if panels > len(envs):
         _ends(axes[len(envs)], envs, runs, methods)
     for ax in axes[panels:]:
@@ -238,12 +276,13 @@ def draw(
     return figure
 
 
-def _curves(ax: Axes, env: str, of: dict[str, dict[int, Curve]]) -> None:
+def _curves(ax: Axes, env: str, of: dict[str, dict[int, Curve]], measure: str) -> None:
     """Interquartile mean and interval per method, and what was published."""
     for i, (method, seeds) in enumerate(of.items()):
         if not seeds:
             continue
-        grid = np.linspace(0, min(curve.steps[-1] for curve in seeds.values()), 150)
+        first = max(curve.steps[0] for curve in seeds.values())
+        grid = np.linspace(first, min(curve.steps[-1] for curve in seeds.values()), 150)
         y = np.array([np.interp(grid, *curve) for curve in seeds.values()])
         bounds = np.array([interval(column) for column in y.T])
         style = _style(i)
@@ -256,8 +295,10 @@ def _curves(ax: Axes, env: str, of: dict[str, dict[int, Curve]]) -> None:
         ax.axhline(level, color="0.6", lw=0.8, ls=":")
         at = ax.get_yaxis_transform()  # x as a share of the axis, y as it is
         ax.text(x, level, name, transform=at, fontsize=7, color="0.4", va="bottom", ha=side)
-    ax.set(title=env, xlabel="million environment steps of training", ylabel="coverage")
+    ax.set(title=env, xlabel="million environment steps of training", ylabel=measure)
     _finish(ax)
+    if measure == "return":
+        ax.set_ylim(auto=True)
 
 
 def _ends(
@@ -266,8 +307,7 @@ def _ends(
     """Coverage at the end over environments: interquartile mean and interval per method."""
     for i, method in enumerate(methods):
         there = [j for j, env in enumerate(envs) if (env, method) in runs]
-        ends = [[run.coverage[-1] for run in runs[envs[j], method].values()] for j in there]
-        found = np.array([interval(np.array(end)) for end in ends]).reshape(-1, 3)
+        found = np.array([interval(ends(runs[envs[j], method])) for j in there]).reshape(-1, 3)
         value, low, high = found.T
         x = np.array(there) + 0.04 * (i - len(methods) / 2)  # so that no bar hides another
         ax.errorbar(x, value, (value - low, high - value), label=method, capsize=3, **_style(i))

@@ -36,20 +36,21 @@ from goalgan_bt.progress import complain, say
 
 SHIPPED = Path(__file__).parent / "studies"
 KEY = ("env", "method", "seed")
-CURVES = (*KEY, "steps", "coverage")  # columns of runs.csv, a row per report
 OURS = {"--env", "--seed", "--out", "--resume", "--viz", "--threads", "--help", "-h"}
 COSTS = (*KEY, "flags", "commit", "train", "label", "eval", "seconds")  # of costs.csv
 
 
 class Study(NamedTuple):
-    """name: of the file; envs, methods (name -> flags), seeds: the grid; flags: of all. An
-    environment may have flags of its own behind its name."""
+    """name: of the file; envs, methods (name -> flags), seeds: the grid; flags: of all; measure:
+    what is compared, "coverage" or (locomotion) "return". An environment may have flags of its own
+    behind its name."""
 
     name: str
     envs: list[str]
     methods: dict[str, str]
     seeds: range
     flags: str
+    measure: str
 
 
 class Run(NamedTuple):
@@ -71,8 +72,8 @@ class StudyConfig:
     """Run a study, or what is missing of it, and write its tables, report and picture."""
 
     study: tyro.conf.Positional[str]
-    """A TOML file, or one of those that come along: point_umaze, ant_umaze,
-    point_nd, ablations, four_rooms, four_rooms_ablations."""
+    """A TOML file, or one of those that come along: point_umaze, ant_umaze, point_nd, ablations,
+    four_rooms, four_rooms_ablations, locomotion_trpo, locomotion_sac."""
     out: Path = Path("docs/studies")
     """Where tables and report go, in a folder with the study's name."""
     runs: Path = Path("runs/studies")
@@ -121,7 +122,10 @@ def load(name: str) -> Study:
     if bad := [name for name in table["methods"] if not re.fullmatch(r"\w[\w.+-]*", name)]:
         raise UsageError(f"{wrong}a method's name is letters, digits, _ . + -, not {bad[0]!r}")
     seeds = range(first, first + table["seeds"])
-    study = Study(path.stem, table["envs"], table["methods"], seeds, flags)
+    measures = {measure(env) for env in table["envs"]}
+    if len(measures) > 1:
+        raise UsageError(f"{wrong}some of its environments have a coverage, others a return")
+    study = Study(path.stem, table["envs"], table["methods"], seeds, flags, measures.pop())
     for run in grid(study._replace(seeds=seeds[:1])):
         try:
             given = {word.split("=")[0] for word in shlex.split(f"{run.env} {run.flags}")}
@@ -150,6 +154,12 @@ def words(run: Run) -> list[str]:
     return [*named, *alone, *shlex.split(run.flags)]
 
 
+def measure(env: str) -> str:
+    """What runs in an environment are judged by: "coverage" or "return"."""
+    other = config.other_learner(["--env", *shlex.split(env)])
+    return "return" if other is locomotion else "coverage"
+
+
 def settings(run: Run) -> Any:
     """The settings that its flags make.
 
@@ -157,10 +167,7 @@ def settings(run: Run) -> Any:
         UsageError: for bad ones.
     """
     asked = words(run)
-    other = config.other_learner(asked)
-    if other is locomotion:
-        raise UsageError("studies compare coverage, and locomotion has none: train it run by run")
-    return (other or config).from_command_line(asked)
+    return (config.other_learner(asked) or config).from_command_line(asked)
 
 
 def perform(run: Run, folder: Path) -> Path:
@@ -202,17 +209,19 @@ def perform(run: Run, folder: Path) -> Path:
 
 
 class Tables:
-    """`runs.csv` and `costs.csv` of a study.
+    """`runs.csv` (a row per report) and `costs.csv` (a row per run) of a study.
 
     Args:
         folder: where they are or shall be.
+        measure: what runs are judged by; the name of its column.
 
     Attributes:
         curves, costs: their rows.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, measure: str) -> None:
+        self.folder, self.measure = folder, measure
+        self._columns = (*KEY, "steps", measure)
         folder.mkdir(parents=True, exist_ok=True)
         self._lock = (folder / ".lock").open("w")
         try:
@@ -222,7 +231,9 @@ class Tables:
         self.costs = _read(folder / "costs.csv", COSTS)
         # Costs are written last: what has none was cut off between the two.
         known = {_key(row) for row in self.costs}
-        self.curves = [row for row in _read(folder / "runs.csv", CURVES) if _key(row) in known]
+        self.curves = [
+            row for row in _read(folder / "runs.csv", self._columns) if _key(row) in known
+        ]
 
     def has(self, run: Run) -> bool:
         """Whether a run is finished.
@@ -241,13 +252,12 @@ class Tables:
         return False
 
     def add(self, run: Run, folder: Path) -> float:
-        """Take in a finished run; its last coverage."""
+        """Take in a finished run; what it measured last."""
         _, rows = record.read_metrics(folder)
         key = dict(zip(KEY, run.key, strict=True))
-        reports = [row for row in rows if row.get("eval/coverage")]
-        self.curves += [
-            key | {"steps": row["steps/train"], "coverage": row["eval/coverage"]} for row in reports
-        ]
+        found = [(row["steps/train"], row.get(f"eval/{self.measure}")) for row in rows]
+        reports = [(steps, value) for steps, value in found if value]
+        self.curves += [key | {"steps": steps, self.measure: value} for steps, value in reports]
         last = rows[-1]
         self.costs.append(
             key
@@ -255,9 +265,9 @@ class Tables:
             | {kind: last[f"steps/{kind}"] for kind in ("train", "label", "eval")}
             | {"seconds": f"{float(last['time/total']):.0f}"}
         )
-        record.write_table(self.folder / "runs.csv", CURVES, self.curves)
+        record.write_table(self.folder / "runs.csv", self._columns, self.curves)
         record.write_table(self.folder / "costs.csv", COSTS, self.costs)
-        return float(reports[-1]["eval/coverage"])
+        return float(reports[-1][1])
 
 
 def _key(row: dict[str, str]) -> tuple[str, ...]:
@@ -318,7 +328,7 @@ def main() -> int:
                 'the report needs matplotlib and scipy: pip install "goalgan_bt[study]"'
             ) from None
         study = load(cfg.study)
-        tables = Tables(cfg.out / study.name)
+        tables = Tables(cfg.out / study.name, study.measure)
         missing = [run for run in grid(study) if not tables.has(run)]
         failed = 0
         if missing and not cfg.report:
@@ -327,7 +337,7 @@ def main() -> int:
             places = cfg.runs / study.name
             for i, (run, job) in enumerate(finished(cfg, missing, places), 1):
                 try:
-                    coverage = tables.add(run, job.result())
+                    last = tables.add(run, job.result())
                 except Exception as error:  # whatever became of one run, the others go on
                     failed += 1
                     complain((str(error).strip().splitlines() or [type(error).__name__])[-1])
@@ -335,7 +345,7 @@ def main() -> int:
                 left = (time.monotonic() - began) / i * (len(missing) - i) / 60
                 say(
                     f"{time.strftime('%H:%M:%S')} {i}/{len(missing)} {run.env} {run.method} "
-                    f"s{run.seed}: coverage {coverage:.3f}  left {left:.0f} min"
+                    f"s{run.seed}: {study.measure} {last:.3f}  left {left:.0f} min"
                 )
         if not tables.costs:
             raise UsageError(f"{tables.folder} holds no finished run yet: run the study first")

@@ -46,12 +46,12 @@ def test_the_interquartile_mean_drops_the_extremes():
 def test_ratios_are_paired_by_seed():
     """Seeds differ tenfold, each pair by a half: the interval is a point."""
     slow = [Curve(np.array([0, 1e6 * k, 9e7]), np.array([0, 0.5, 0.5])) for k in (1, 10, 4)]
-    fast = [Curve(c.steps * [1, 0.5, 1], c.coverage) for c in slow]
+    fast = [Curve(c.steps * [1, 0.5, 1], c.values) for c in slow]
     halved = evidence.ratio(fast, slow, 0.5)
     assert halved.estimate == pytest.approx((0.5, 0.5, 0.5)) and halved.reached == (3, 3)
     assert str(halved) == "0.50 [0.50, 0.50] (3, 3)"
     assert evidence.ratio(slow, fast, 0.5).estimate == pytest.approx((2, 2, 2))
-    never = [Curve(c.steps, c.coverage / 2) for c in slow]
+    never = [Curve(c.steps, c.values / 2) for c in slow]
     assert str(evidence.ratio(fast, never, 0.5)) == "(3, 0)"  # no figure: theirs never arrive
 
 
@@ -132,6 +132,36 @@ def test_what_is_finished_is_not_run_again(finished, tmp_path):
     assert "with the flags" in other.stderr
 
 
+def test_a_study_of_returns(tmp_path):
+    pytest.importorskip("sb3_contrib")
+    methods = 'recall_traces = ""\ntrpo = "--backtracking.trace-length 0"'
+    flags = "--method trpo --total-steps 5000 --episodes 1"
+    text = f'envs = ["hopper"]\nseeds = 2\nflags = "{flags}"\n[methods]\n{methods}'
+    (tmp_path / "run.toml").write_text(text)
+    words = "study", tmp_path / "run.toml", "--out", tmp_path, "--runs", tmp_path / "runs"
+    done = run_module(*words)
+    assert done.returncode == 0 and "4/4 hopper" in done.stdout, done.stderr
+    with (tmp_path / "run/runs.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == ("env", "method", "seed", "steps", "return")
+    assert sorted({int(row["steps"]) for row in rows}) == [4096, 8192]
+    report = (tmp_path / "run/README.md").read_text()
+    assert "| recall_traces less trpo | 2 |" in report and "to 0.63" not in report
+    assert (tmp_path / "run/curves.png").stat().st_size > 10_000
+
+
+def test_differences_are_paired_by_seed():
+    """Seeds differ by hundreds, each pair by ten: the interval is a point."""
+    steps = np.array([1e6, 2e6])
+    of = {
+        name: {seed: Curve(steps, np.array([0.0, more + 100 * seed])) for seed in range(3)}
+        for name, more in (("recall_traces", 10.0), ("trpo", 0.0))
+    }
+    *_, line = evidence._differences(of)
+    assert line == "| recall_traces less trpo | 3 | 5.00 [5.00, 5.00] | 10 [10, 10] |"
+    assert evidence.area(Curve(steps[:1], np.array([7.0]))) == 7.0
+
+
 def test_a_run_that_was_cut_off_goes_on(finished, tmp_path):
     root, _ = finished
     run = study.grid(study.load(str(root / "tiny.toml")))[0]
@@ -158,7 +188,7 @@ def test_a_run_that_fails_says_why(tmp_path):
 
 def test_two_studies_do_not_share_a_table(finished):
     root, _ = finished
-    tables = study.Tables(root / "out/tiny")
+    tables = study.Tables(root / "out/tiny", "coverage")
     words = "study", root / "tiny.toml", "--out", root / "out"
     other = run_module(*words)
     assert other.returncode == 2 and "another study's at work" in other.stderr
@@ -170,7 +200,7 @@ def test_a_table_cut_off_between_its_files_mends_itself(finished, tmp_path):
     out = shutil.copytree(root / "out/tiny", tmp_path / "tiny")
     lines = (out / "costs.csv").read_text().splitlines(keepends=True)
     (out / "costs.csv").write_text("".join(line for line in lines if ",goal_gan,0," not in line))
-    tables = study.Tables(out)
+    tables = study.Tables(out, "coverage")
     keys = {(row["method"], row["seed"]) for row in tables.curves}
     assert len(keys) == 3 and ("goal_gan", "0") not in keys
 
@@ -186,6 +216,7 @@ def test_a_table_cut_off_between_its_files_mends_itself(finished, tmp_path):
         (TINY.replace("--method goal_gan", "--help"), "--help is the study's own"),
         (TINY.replace("--method goal_gan", "'"), "No closing quotation"),
         (TINY.replace('["point_umaze"]', '["point_umaze", "point_umaze"]'), "twice"),
+        (TINY.replace('["point_umaze"]', '["point_umaze", "hopper"]'), "others a return"),
         ("envs = ", "cannot read"),
         ('envs = ["point_umaze"]\nseeds = 1', "needs methods"),
         ('envs = ["moon"]\nseeds = 1\n[methods]\na = ""', "moon"),
