@@ -39,8 +39,9 @@ until coverage first reaches 0.63, on lines between reports; runs that never do 
 Steps (millions) and wall time (with one simulation thread) are means per run."""
 
 
-DIFFERENCES = """Difference to another method, paired by seed: mean and 95% interval (Student's)."""
-RETURN_NOTES = """Interquartile means over seeds with 95% percentile bootstrap intervals (with three seeds they reach
+DIFFERENCES = "Difference to another method, paired by seed: mean and 95% interval (Student's)."
+RETURN_NOTES = """\
+Interquartile means over seeds with 95% percentile bootstrap intervals (with three seeds they reach
 from the lowest to the highest). `area`: mean return over the run, from the first report on. Steps
 (millions) and wall time (with one thread) are means per run."""
 
@@ -254,7 +255,7 @@ def _differences(of: dict[str, dict[int, Curve]]) -> list[str]:
     if not lines:
         return []
     heads = ["| difference | seeds | area | at the end |", "| --- | --- | --- | --- |"]
-    return [*DIFFERENCES.splitlines(), "", *heads, *lines]
+    return [DIFFERENCES, "", *heads, *lines]
 
 
 def draw(study: Study, runs: dict[tuple[str, str], dict[int, Curve]]) -> Figure:

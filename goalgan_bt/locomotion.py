@@ -28,7 +28,7 @@ TASKS = {
 # The paper's tables; it has no TRPO on the Humanoid.
 TRACE_LENGTH = {"half_cheetah": 20, "walker2d": 20, "hopper": 20, "ant": 50, "humanoid": 50}
 TRPO_TRACE_LENGTH = TRACE_LENGTH | {"hopper": 10}
-REPORTS = 50  # per run
+REPORTS = 25  # per run
 BATCH = 4096  # steps of a TRPO update
 TEST_SEED = 10_000  # other first states than in training
 

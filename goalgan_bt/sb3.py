@@ -27,6 +27,8 @@ from torch.distributions import Normal, kl_divergence
 from goalgan_bt.backtracking import BacktrackingModel, Transitions, recall_traces
 from goalgan_bt.checkpoint import restore
 from goalgan_bt.envs.maze import BoolArray, FloatArray
+from goalgan_bt.forward import ForwardModel
+from goalgan_bt.rollout import Float32
 from goalgan_bt.settings import BacktrackingConfig, RecallConfig
 
 EDGE = 0.999  # of the range of a squashed action, beyond which its inverse is taken as there
@@ -71,8 +73,9 @@ class RecallTraces(BaseCallback):
         verbose: as of every callback.
 
     Attributes:
-        trajectories: what is remembered, the newest last; backtracking: the model, once learning
-            has begun; last: what the last turn gave (see `turn`); seconds: what all turns took.
+        trajectories: what is remembered, the newest last; dynamics: the backtracking model (or the
+            forward one, see `RecallConfig.model`), once learning has begun; last: what the last
+            turn gave (see `turn`); seconds: what all turns took.
 
     Raises:
         ValueError: for settings that make no sense.
@@ -86,7 +89,7 @@ class RecallTraces(BaseCallback):
         if problem := self.cfg.problem():
             raise ValueError(problem)
         self.trajectories: deque[Trajectory] = deque()
-        self.backtracking: BacktrackingModel | None = None
+        self.dynamics: BacktrackingModel | ForwardModel | None = None
         self._rng, self._noise = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
         self._remembered, self._turned = 0, 0
         self._moments: dict[str, Any] | None = None  # of a saved optimiser
@@ -94,8 +97,10 @@ class RecallTraces(BaseCallback):
         self.last: dict[str, float] = {}
         self.seconds = 0.0
 
-    def _model(self, obs_dim: int, act_dim: int) -> BacktrackingModel:
+    def _new_model(self, obs_dim: int, act_dim: int) -> BacktrackingModel | ForwardModel:
         cfg = BacktrackingConfig(batch=256, steps=self.cfg.model_steps)
+        if self.cfg.model == "forward":
+            return ForwardModel(obs_dim, act_dim, cfg, self._noise)
         return BacktrackingModel(obs_dim, act_dim, 0, cfg, self._noise)
 
     def _init_callback(self) -> None:
@@ -114,8 +119,8 @@ class RecallTraces(BaseCallback):
         self._squashed = isinstance(policy, SACPolicy)
         self._learner = policy.actor if self._squashed else policy
         self._low, self._high = actions.low.astype(float), actions.high.astype(float)
-        if self.backtracking is None:
-            self.backtracking = self._model(space.shape[0], actions.shape[0])
+        if self.dynamics is None:
+            self.dynamics = self._new_model(space.shape[0], actions.shape[0])
         if self._agent is not self.model:
             self._agent, self._turned = self.model, self.model.num_timesteps
             self._optimiser = torch.optim.Adam(self._learner.parameters(), self.cfg.learning_rate)
@@ -133,7 +138,7 @@ class RecallTraces(BaseCallback):
     def _on_step(self) -> bool:
         given = self.locals
         actions = given.get("clipped_actions", given["actions"])
-        told = 2 * (actions - self._low) / (self._high - self._low) - 1
+        told = self._told(actions)
         normalising = self.model.get_vec_normalize_env()
         rewards = given["rewards"] if normalising is None else normalising.get_original_reward()
         last_obs: Any = self.model._last_obs
@@ -182,15 +187,16 @@ class RecallTraces(BaseCallback):
         """One turn of Algorithm 1 besides the agent's own: train the model, recall, imitate.
 
         Returns:
-            threshold: L; action_nll, state_nll: see `BacktrackingModel`; valid: share of the steps
-            of the traces before they ended; loss, kl, log_ratio: see `_imitate`. Nothing while
-            there is too little to learn from.
+            threshold: L; action_nll, state_nll, or forward_nll: see the models; valid: share of the
+            steps of the traces before they ended; loss, kl, log_pi: see `_imitate`; log_ratio:
+            log pi(a | s) - log q(a | s') before it, nats per step: of the paper's lower bound of
+            log p(R > L) (section 4) the part that is known; the world's transitions are not.
+            Nothing while there is too little to learn from.
         """
         chosen, threshold = self.best()
         total = sum(len(one.rewards) for one in chosen)
         if total < self.cfg.min_steps:
             return {}
-        assert self.backtracking is not None
         states, following = (
             np.concatenate([one.obs[rows] for one in chosen])
             for rows in (slice(-1), slice(1, None))
@@ -201,8 +207,15 @@ class RecallTraces(BaseCallback):
         data_cfg = BacktrackingConfig(buffer=total, min_transitions=1)
         data = Transitions(space.state_dim, space.act_dim, 0, data_cfg)
         data.add(states, actions, following, np.empty((total, 0)), np.zeros(total))
-        self.backtracking.seen = 0  # none of it is held out: it may have been there before
-        metrics = {"threshold": threshold, **self.backtracking.fit(data)}
+        model = self.dynamics
+        assert model is not None
+        if isinstance(model, ForwardModel):
+            metrics = {"threshold": threshold, **model.fit(data)}
+            told, done, valid = self._imagine(model, space, states)
+            metrics["valid"] = float(valid.mean())
+            return metrics | (self._imitate(told, done, states) if len(told) else {})
+        model.seen = 0  # none of it is held out: it may have been there before
+        metrics = {"threshold": threshold, **model.fit(data)}
 
         worth = rewards
         if self.cfg.seeds == "value":  # of reaching a state: where it ends, nothing follows
@@ -212,13 +225,40 @@ class RecallTraces(BaseCallback):
             worth = rewards + self._agent.gamma * future
         seeds = following[np.argsort(worth)[-self.cfg.traces :]].astype(float)
         nowhere = np.empty((len(seeds), 0))
-        traces = recall_traces(self.backtracking, space, seeds, nowhere, self.cfg.trace_length)
+        traces = recall_traces(model, space, seeds, nowhere, self.cfg.trace_length)
         metrics["valid"] = float(traces.valid.mean())
         if traces.valid.any():
             after = np.concatenate([seeds[None], traces.states[:-1]])[traces.valid]
-            recalled = traces.states[traces.valid], traces.actions[traces.valid], after
+            recalled = traces.states[traces.valid], traces.actions[traces.valid]
+            happened = (torch.from_numpy(x).float() for x in (after, recalled[1]))
+            log_q = model.action_log_density(*happened).mean().item()
             metrics |= self._imitate(*recalled, states)
+            metrics["log_ratio"] = metrics["log_pi"] - log_q
         return metrics
+
+    def _imagine(
+        self, model: ForwardModel, space: Seen, states: FloatArray
+    ) -> tuple[Float32, Float32, BoolArray]:
+        """Let the policy act in a forward model from some of the states (m, obs_dim).
+
+        Returns:
+            States and actions in [-1, 1] of the half that ends best, (n, obs_dim), (n, act_dim);
+            which of all steps were valid, (trace_length, traces).
+        """
+        now = states[self._rng.integers(len(states), size=self.cfg.traces)]
+        told = np.empty((self.cfg.trace_length, *now.shape), np.float32)
+        done = np.empty((*told.shape[:2], space.act_dim), np.float32)
+        valid = np.empty(told.shape[:2], dtype=bool)
+        going = np.ones(len(now), dtype=bool)
+        for t in range(self.cfg.trace_length):
+            told[t], done[t] = now, self._sample(now)
+            following = model.successors(*map(torch.from_numpy, (told[t], done[t]))).numpy()
+            going &= space.valid(following)
+            valid[t] = going
+            now = np.where(going[:, None], following, now)
+        worth = self._values(now)
+        kept = valid & (worth >= np.median(worth))
+        return told[kept], done[kept], valid
 
     def _gaussian(self, obs: Tensor) -> Normal:
         """The policy before it is squashed or clipped."""
@@ -228,6 +268,18 @@ class RecallTraces(BaseCallback):
         found = self._learner.get_distribution(obs).distribution
         assert isinstance(found, Normal)
         return found
+
+    @torch.no_grad()
+    def _sample(self, obs: FloatArray) -> FloatArray:
+        """Actions of the policy at observations (n, obs_dim), (n, act_dim) in [-1, 1]."""
+        found = self._gaussian(self._tensor(obs))
+        noise = self._tensor(torch.randn(found.mean.shape, generator=self._noise).numpy())
+        actions = (found.mean + found.stddev * noise).cpu().numpy()
+        return np.tanh(actions) if self._squashed else self._told(actions).clip(-1, 1)
+
+    def _told(self, actions: FloatArray) -> FloatArray:
+        """Actions of the environment's range in [-1, 1]."""
+        return 2 * (actions - self._low) / (self._high - self._low) - 1
 
     def _tensor(self, array: FloatArray) -> Tensor:
         return torch.as_tensor(array, dtype=torch.float32, device=self.model.device)
@@ -245,20 +297,18 @@ class RecallTraces(BaseCallback):
         self,
         states: FloatArray,
         actions: FloatArray,
-        following: FloatArray,
         seen: FloatArray,
     ) -> dict[str, float]:
         """Maximise log pi(a | s) of recalled steps. The gradient goes through the mean only; the
         std of SAC's policy, which shares layers with the mean, may follow.
 
         Args:
-            states, actions, following: (n, obs_dim), (n, act_dim) in [-1, 1], (n, obs_dim).
+            states, actions: (n, obs_dim), (n, act_dim) in [-1, 1].
             seen: (m, obs_dim) states on which the KL is bounded.
 
         Returns:
-            loss: -log pi, nats; kl: on those states; log_ratio: log pi(a | s) - log q(a | s')
-            before the imitation, nats per step: of the paper's lower bound of log p(R > L)
-            (section 4) the part that is known; the world's transitions are not.
+            loss: -log pi, nats; kl: on those states; log_pi: log pi(a | s) before the imitation,
+            nats per step.
         """
         obs, goals = self._tensor(states), self._tensor(actions)
         if self._squashed:
@@ -273,10 +323,6 @@ class RecallTraces(BaseCallback):
         with torch.no_grad():
             old, before = self._gaussian(reference), self._gaussian(obs)
             log_pi = (before.log_prob(goals) + slope).sum(dim=1).mean().item()
-        assert self.backtracking is not None
-        log_q = self.backtracking.action_log_density(
-            torch.as_tensor(following).float(), torch.as_tensor(actions).float()
-        ).mean()
         loss, kl, params = np.nan, 0.0, list(self._learner.parameters())
         for step in range(self.cfg.imitation_steps):
             some = torch.from_numpy(self._rng.integers(len(obs), size=self.cfg.imitation_batch))
@@ -296,7 +342,7 @@ class RecallTraces(BaseCallback):
                         param.copy_(value)
                     break
             kl = new_kl
-        return {"loss": loss, "kl": kl, "log_ratio": log_pi - log_q.item()}
+        return {"loss": loss, "kl": kl, "log_pi": log_pi}
 
     def save(self, path: Path | str) -> None:
         """Write settings, model and trajectories, to go on with a saved agent (`load`).
@@ -304,13 +350,13 @@ class RecallTraces(BaseCallback):
         Raises:
             ValueError: if nothing was learned yet.
         """
-        if self.backtracking is None or not self.trajectories:
+        if self.dynamics is None or not self.trajectories:
             raise ValueError("nothing was learned yet: save after `learn`")
         moments = self._optimiser.state_dict() if self._agent is not None else self._moments
         state = {
             "cfg": asdict(self.cfg),
-            "model": self.backtracking.state_dict(),
-            "model_optimiser": self.backtracking.optimiser.state_dict(),
+            "model": self.dynamics.state_dict(),
+            "model_optimiser": self.dynamics.optimiser.state_dict(),
             "optimiser": moments,
             "trajectories": [
                 [*(torch.from_numpy(x) for x in one[:3]), one.terminated]
@@ -337,8 +383,8 @@ class RecallTraces(BaseCallback):
             callback.trajectories.append(one)
             callback._remembered += len(one.rewards)
         first = callback.trajectories[0]
-        callback.backtracking = callback._model(first.obs.shape[1], first.actions.shape[1])
-        callback.backtracking.load_state_dict(state["model"])
-        restore(callback.backtracking.optimiser, state["model_optimiser"])
+        callback.dynamics = callback._new_model(first.obs.shape[1], first.actions.shape[1])
+        callback.dynamics.load_state_dict(state["model"])
+        restore(callback.dynamics.optimiser, state["model_optimiser"])
         callback._moments = state["optimiser"]
         return callback

@@ -204,6 +204,10 @@ class CoverageConfig:
 class RecallConfig:
     """Recall traces beside an agent of Stable-Baselines3: what is recalled, how it is imitated."""
 
+    model: Literal["backward", "forward"] = "backward"
+    """What is learned: the backtracking model, or a control (the paper's appendix, after Dyna): a
+    forward model, in which the policy acts; it imitates the better half of what it imagines, by
+    the critic's value of where that ends."""
     trace_length: int = 20
     """Steps of a recall trace (paper: 20; with TRPO Hopper 10; Ant and Humanoid 50)."""
     traces: int = 64

@@ -15,7 +15,7 @@ from stable_baselines3.common.logger import configure  # noqa: E402
 from stable_baselines3.common.vec_env import VecNormalize  # noqa: E402
 
 from goalgan_bt import sb3  # noqa: E402
-from goalgan_bt.sb3 import RecallConfig, RecallTraces, Trajectory  # noqa: E402
+from goalgan_bt.sb3 import RecallConfig, RecallTraces, Seen, Trajectory  # noqa: E402
 
 FASTEST = np.array([0.2, 0.4], np.float32)
 AGENTS = {"SAC": SAC, "TRPO": sb3_contrib.TRPO, "PPO": PPO}
@@ -145,7 +145,7 @@ def test_imitation_moves_the_mean(name):
 
     (mean, std), kl = now(), 0.0
     for _ in range(10):
-        kl = max(kl, callback._imitate(states, towards, states, states)["kl"])
+        kl = max(kl, callback._imitate(states, towards, states)["kl"])
     new_mean, new_std = now()
     assert 0 < kl <= 0.05
     gap, new_gap = (np.abs(x - towards).mean() for x in (mean, new_mean))
@@ -197,13 +197,32 @@ def test_the_log_density_is_that_of_the_model():
     """Against torch's own Gaussian, in units of the actions."""
     callback = recall()
     agent("PPO", make_vec_env(Reach, n_envs=2, seed=0), n_steps=512).learn(4096, callback=callback)
-    model = callback.backtracking
+    model = callback.dynamics
     following, actions = torch.rand(50, 2), 2 * torch.rand(50, 2) - 1
     with torch.no_grad():
         mean = model.action_net(model.state_scale.normalise(following))
     said = torch.distributions.Normal(model.action_scale.restore(mean), model.action_scale.std)
     found = model.action_log_density(following, actions)
     torch.testing.assert_close(found, said.log_prob(actions).sum(dim=1), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["SAC", "PPO"])
+def test_the_forward_control_imitates_what_it_imagined_to_end_well(name, monkeypatch):
+    callback = recall(model="forward", traces=20, model_steps=200)
+    model = agent(name, make_vec_env(Reach, n_envs=1, seed=0))
+    model.learn(1600, callback=callback)
+    assert {"forward_nll", "valid", "loss", "kl"} <= set(callback.last)
+    # In a model in which nothing stands in the way: places add up, and the left half is forgotten.
+    monkeypatch.setattr(callback.dynamics, "successors", lambda s, a: s + 0.1 * a)
+    monkeypatch.setattr(callback, "_values", lambda obs: obs[:, 0])
+    space = Seen(np.random.default_rng(0).uniform(-1, 1, (500, 2)), 2)
+    begins = np.random.default_rng(1).uniform(-0.5, 0.5, (50, 2)).astype(np.float32)
+    states, actions, valid = callback._imagine(callback.dynamics, space, begins)
+    assert valid.shape == (5, 20) and valid.all() and len(states) == len(actions) == 5 * 10
+    paths, moves = states.reshape(5, 10, 2), actions.reshape(5, 10, 2)
+    assert abs(moves).max() <= 1 and moves.std() > 0.1
+    np.testing.assert_allclose(paths[1:], paths[:-1] + 0.1 * moves[:-1], rtol=1e-5, atol=1e-6)
+    assert paths[-1, :, 0].mean() > begins[:, 0].mean()
 
 
 def test_traces_begin_where_it_pays_to_be(monkeypatch):
