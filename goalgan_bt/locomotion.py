@@ -49,6 +49,11 @@ class LocomotionConfig:
     """Folder of runs; this run gets a folder of its own in it."""
     num_envs: int = 4
     """Environments side by side (SAC: 1)."""
+    hidden: int = 64
+    """Units of each of the agent's two hidden layers (TRPO: 64 as sb3-contrib; SAC: 128 as its
+    authors' first code, half the time of Stable-Baselines3's 256)."""
+    minibatch: int = 128
+    """Steps of a gradient step of SAC, or of TRPO's value function."""
     episodes: int = 5
     """Episodes of the deterministic policy in each measurement."""
     backtracking: RecallConfig = field(default_factory=RecallConfig)
@@ -70,8 +75,14 @@ def preset(env: str, method: str) -> LocomotionConfig:
     if method not in ("trpo", "sac"):
         raise UsageError(f"unknown method {method!r}: choose trpo or sac")
     if method == "sac":
-        length = RecallConfig(trace_length=TRACE_LENGTH[env])
-        return LocomotionConfig(env, "sac", total_steps=200_000, num_envs=1, backtracking=length)
+        return LocomotionConfig(
+            env,
+            "sac",
+            total_steps=200_000,
+            num_envs=1,
+            hidden=128,
+            backtracking=RecallConfig(trace_length=TRACE_LENGTH[env]),
+        )
     return LocomotionConfig(env, backtracking=RecallConfig(trace_length=TRPO_TRACE_LENGTH[env]))
 
 
@@ -85,7 +96,7 @@ def from_command_line(argv: list[str]) -> LocomotionConfig:
     default = preset(value_of(argv, "--env") or "hopper", value_of(argv, "--method") or "trpo")
     cfg = parse(LocomotionConfig, argv, "python -m goalgan_bt.train", default)
     for names, good, what in (
-        ("total_steps num_envs episodes", lambda x: x >= 1, "1 or more"),
+        ("total_steps num_envs episodes hidden minibatch", lambda x: x >= 1, "1 or more"),
         ("seed", lambda x: x >= 0, "0 or more"),
     ):
         if bad := fault(cfg, names, good, what):
@@ -122,12 +133,21 @@ def train(cfg: LocomotionConfig, folder: Path) -> float:
     torch.set_num_threads(1)
     env: Any = make_vec_env(TASKS[cfg.env], cfg.num_envs, seed=cfg.seed)
     test_env: Any = make_vec_env(TASKS[cfg.env], 1, seed=TEST_SEED + cfg.seed)
+    common: Any = {
+        "seed": cfg.seed,
+        "device": "cpu",
+        "batch_size": cfg.minibatch,
+        "policy_kwargs": {
+            "net_arch": [cfg.hidden, cfg.hidden],
+            "optimizer_kwargs": {"fused": True},
+        },
+    }
     if cfg.method == "trpo":  # as rllab's, it sees normalised observations
         env, test_env = VecNormalize(env), VecNormalize(test_env, training=False, norm_reward=False)
         steps = max(1, BATCH // cfg.num_envs)
-        agent: Any = TRPO("MlpPolicy", env, n_steps=steps, seed=cfg.seed, device="cpu")
+        agent: Any = TRPO("MlpPolicy", env, n_steps=steps, **common)
     else:
-        agent = SAC("MlpPolicy", env, seed=cfg.seed, device="cpu")
+        agent = SAC("MlpPolicy", env, **common)
     traced = cfg.backtracking.trace_length > 0
     recall = RecallTraces(cfg.backtracking, cfg.seed) if traced else None
 

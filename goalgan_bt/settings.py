@@ -244,4 +244,5 @@ class RecallConfig:
                 return f"{name} must be greater than 0, not {getattr(self, name)}"
         if self.top_percent > 100:
             return f"top_percent must be at most 100, not {self.top_percent}"
-        return None if self.model_steps >= 0 else "model_steps must be 0 or more"
+        least = 1 if self.model == "forward" else 0  # a random one is a control of the other only
+        return None if self.model_steps >= least else f"model_steps must be {least} or more"
