@@ -36,6 +36,10 @@ def test_a_run_of_the_hopper(method, steps, tmp_path):
     assert float(rows[-1]["eval/return"]) > 0 and float(rows[-1]["recall/kl"]) >= 0
     weights = torch.load(folder / "policy.pt", weights_only=True)
     assert any(name.startswith(("actor", "action_net")) for name in weights)
+    drawn = run_module("plot", folder)
+    assert drawn.returncode == 0 and (folder / "coverage.png").stat().st_size > 10_000
+    watched = run_module("viz", folder)
+    assert watched.returncode == 2 and "hopper has no map" in watched.stderr
 
 
 def test_without_traces_nothing_is_recalled(tmp_path):

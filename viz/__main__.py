@@ -8,8 +8,10 @@ if __name__ == "__main__":  # a page has nothing to lose: it goes at once, witho
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
     signal.signal(signal.SIGTERM, lambda *_: os._exit(2))
 
+import contextlib
 import importlib.util
 import ipaddress
+import json
 import socket
 import threading
 from dataclasses import dataclass
@@ -17,6 +19,7 @@ from pathlib import Path
 
 import tyro
 
+from goalgan_bt import config
 from goalgan_bt.command_line import UsageError, parse
 from goalgan_bt.progress import complain, say
 
@@ -43,6 +46,8 @@ def main() -> int:
     """The command line; returns the exit code."""
     try:
         cfg = from_command_line()
+        for folder in cfg.runs:
+            check(folder)
         if cfg.with_parent:
             threading.Thread(target=_wait_for_parent, daemon=True).start()
         if cfg.export is not None or cfg.movie is not None:
@@ -53,6 +58,19 @@ def main() -> int:
         complain(str(error))
         return 2
     return 0
+
+
+def check(folder: Path) -> None:
+    """See that there will be a map to look at.
+
+    Raises:
+        UsageError: if the run's learner draws none.
+    """
+    env = ""
+    with contextlib.suppress(OSError, ValueError, TypeError, KeyError):  # told of by who reads it
+        env = str(json.loads((folder / "config.json").read_text())["env"])
+    if config.other_learner(["--env", env]):
+        raise UsageError(f"{env} has no map: python -m goalgan_bt.plot draws the run's curve")
 
 
 def serve(cfg: ViewConfig) -> None:

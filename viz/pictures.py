@@ -19,8 +19,9 @@ COLOURS = "RdYlBu"
 LABELS = {-1: ("too hard", "#a50026"), 0: ("intermediate", "#111111"), 1: ("too easy", "#4575b4")}
 
 
-def coverage_curve(ax: Axes, folders: list[Path], until: int | None = None) -> None:
-    """Measured coverage over training steps, a line per run, and the published figures.
+def curve(ax: Axes, folders: list[Path], until: int | None = None) -> None:
+    """Measured coverage over training steps, a line per run, and the published figures; where runs
+    have no coverage, their return.
 
     Args:
         ax: where to draw.
@@ -28,26 +29,32 @@ def coverage_curve(ax: Axes, folders: list[Path], until: int | None = None) -> N
         until: the last iteration to draw; the axes stay those of the whole run.
 
     Raises:
-        RunError: if a folder is no run.
+        RunError: if a folder is no run, or some have coverage and others not.
     """
+    tables = [record.read_metrics(folder) for folder in folders]
+    covered = {"eval/coverage" in names or "eval/return" not in names for names, _ in tables}
+    if len(covered) > 1:
+        raise record.RunError("some of these runs have a coverage, others a return: one at a time")
+    measure = "coverage" if covered == {True} else "return"
     references: dict[Published, None] = {}  # in the order given
-    for i, folder in enumerate(folders):
-        _, rows = record.read_metrics(folder)
-        rows = [row for row in rows if row.get("eval/coverage")]
+    for i, (folder, (_, rows)) in enumerate(zip(folders, tables, strict=True)):
+        rows = [row for row in rows if row.get(f"eval/{measure}")]
         known = sum(until is None or int(row["iteration"]) <= until for row in rows)
         steps = [float(row.get("steps/train") or "nan") for row in rows]
-        coverage = [float(row["eval/coverage"]) for row in rows]
-        coverage[known:] = [math.nan] * (len(rows) - known)
+        values = [float(row[f"eval/{measure}"]) for row in rows]
+        values[known:] = [math.nan] * (len(rows) - known)
         run = Run(folder)
-        ax.plot(steps, coverage, color=f"C{i}", label=_title(run), marker=".", markersize=4)
+        ax.plot(steps, values, color=f"C{i}", label=_title(run), marker=".", markersize=4)
         references |= dict.fromkeys(published(run.settings))
     for line, grey in zip(references, ("0.65", "0.35") * 9, strict=False):
         label = f"{line.method} (published)"
         ax.plot(*zip(*line.points, strict=True), "o--", color=grey, markersize=3, label=label)
         ax.set_xscale("log")
-    ax.set(xlabel="environment steps of training", ylabel="coverage", ylim=(0, 1))
+    ax.set(xlabel="environment steps of training", ylabel=measure)
+    if measure == "coverage":
+        ax.set_ylim(0, 1.02)
     ax.grid(alpha=0.25)
-    ax.legend(fontsize=7, frameon=False, loc="upper left")
+    ax.legend(fontsize=7, frameon=False, loc="best")
 
 
 def _title(run: Run) -> str:
@@ -137,5 +144,5 @@ def overview(folders: list[Path], maps: int = 4, at: tuple[int, ...] = ()) -> Fi
         axes[0].set_ylabel(_title(Run(folder)).replace(" ", "\n"), fontsize=7)
         axes[0].legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=3)
         figure.colorbar(image, ax=axes, label="success", shrink=0.8)
-    coverage_curve(figure.add_subplot(grid[rows, :]), folders)
+    curve(figure.add_subplot(grid[rows, :]), folders)
     return figure
