@@ -56,7 +56,7 @@ from goalgan_bt.learner import Learner
 from goalgan_bt.progress import Progress, complain, say
 from goalgan_bt.record import Record
 from goalgan_bt.rollout import Collector, Float32, Rollouts, flat
-from goalgan_bt.viz.child import Page
+from goalgan_bt.viz.child import Page, free_port
 
 TEST_ENVS = 512  # simulations side by side when coverage is measured
 FRAME_TRACES = 64  # traces kept in a frame
@@ -421,6 +421,8 @@ def main() -> int:
             ranks.begin()
             if ranks.rank() == 0:
                 env = make_env(cfg, 1)
+                if cfg.viz == "browser":
+                    free_port(cfg.viz_host, cfg.viz_port)  # or there will be no run
                 # With its settings: the page reads them before training begins.
                 begin = cfg.out, env.name, cfg.seed, asdict(cfg), env.maze
                 folder = cfg.resume or record.new_run(*begin)

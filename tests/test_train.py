@@ -221,6 +221,7 @@ def test_a_damaged_checkpoint_is_refused_in_one_line(tmp_path, damage):
         (["--env", "point_umaze", "--iterations", "-3"], "--iterations must be greater than 0"),
         (["--env", "point_umaze", "--map", "none.txt"], "cannot read the map none.txt"),
         (["--env", "point_nd", "--dim", "9"], "--dim must be 2 to 6, not 9"),
+        (["--viz", "browser", "--viz-host", "192.0.2.1"], "cannot listen on 192.0.2.1"),
         (["--resume", "nowhere"], "nowhere is no run"),
         (["--resume", "nowhere", "--help"], "nowhere is no run"),
         (["--frobnicate"], "frobnicate"),

@@ -22,6 +22,7 @@ import tyro
 from goalgan_bt import config
 from goalgan_bt.command_line import UsageError, parse
 from goalgan_bt.progress import complain, say
+from goalgan_bt.viz.child import free_port
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ def serve(cfg: ViewConfig) -> None:
     from goalgan_bt.viz.view import View
 
     os.nice(19)  # looking must not slow learning; threads take it from the one that starts them
-    port = _free_port(cfg.host, cfg.port)
+    port = free_port(cfg.host, cfg.port)
     view = View([Run(folder) for folder in cfg.runs], cfg.host, port)
     busy = cfg.port not in (0, view.server.get_port())
     say(f"view: {view.address}" + (f" (port {cfg.port} was busy)" if busy else ""))
@@ -147,22 +148,6 @@ def _check_target(path: Path, kinds: tuple[str, ...]) -> None:
         raise UsageError(f"cannot write '{path}': its name must end in {' or '.join(kinds)}")
     if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
         raise UsageError(f"cannot write '{path}': choose a file in a folder that can be written")
-
-
-def _free_port(host: str, port: int) -> int:
-    """That port, or a later one if it is busy.
-
-    Raises:
-        UsageError: if one cannot listen at that address at all.
-    """
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    for candidate in [*range(port, min(port + 100, 65536)), 0]:
-        try:
-            socket.create_server((host, candidate), family=family).close()
-            return candidate
-        except OSError as error:
-            reason = error
-    raise UsageError(f"cannot listen on {host}: {reason}")
 
 
 def _is_loopback(host: str) -> bool:

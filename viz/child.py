@@ -1,11 +1,13 @@
 """The page that training opens: `python -m goalgan_bt.viz` as a child process."""
 
 import contextlib
+import socket
 import subprocess
 import sys
 import threading
 from pathlib import Path
 
+from goalgan_bt.command_line import UsageError
 from goalgan_bt.progress import complain, say
 
 
@@ -58,3 +60,19 @@ class Page:
                 elif line.startswith("error: "):
                     complain(line.removeprefix("error: ").strip())
         self._known.set()
+
+
+def free_port(host: str, port: int) -> int:
+    """That port, or a later one if it is busy.
+
+    Raises:
+        UsageError: if one cannot listen at that address at all.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    for candidate in [*range(port, min(port + 100, 65536)), 0]:
+        try:
+            socket.create_server((host, candidate), family=family).close()
+            return candidate
+        except OSError as error:
+            reason = error
+    raise UsageError(f"cannot listen on {host}: {reason}")
