@@ -41,9 +41,10 @@ Steps (millions) and wall time (with one simulation thread) are means per run.""
 
 DIFFERENCES = "Difference to another method, paired by seed: mean and 95% interval (Student's)."
 RETURN_NOTES = """\
-Interquartile means over seeds with 95% percentile bootstrap intervals (with three seeds they reach
-from the lowest to the highest). `area`: mean return over the run, from the first report on. Steps
-(millions) and wall time (with one thread) are means per run."""
+Interquartile means over seeds with 95% percentile bootstrap intervals; with three seeds those are
+the mean, the lowest and the highest. Of several comparisons some differ by chance. `area`: mean
+return over the run, from the first report on. Steps (millions) and wall time (with one thread) are
+means per run."""
 
 
 class Curve(NamedTuple):
@@ -63,6 +64,8 @@ class Interval(NamedTuple):
 
     def __str__(self) -> str:
         digits = 2 if abs(self.value) < 10 else 0  # of a coverage, of a return
+        if np.isnan(self.low):
+            return f"{self.value:.{digits}f}"
         return f"{self.value:.{digits}f} [{self.low:.{digits}f}, {self.high:.{digits}f}]"
 
 
@@ -245,8 +248,11 @@ def _ratios(of: dict[str, dict[int, Curve]]) -> list[str]:
 
 def _differences(of: dict[str, dict[int, Curve]]) -> list[str]:
     reference = next((method for method in REFERENCES if method in of), next(iter(of)))
+    pairs = [(method, reference) for method in of]
+    if "recall_traces" in of:  # whose controls are to be compared with it, too
+        pairs += [("recall_traces", method) for method in of if method != reference]
     lines = []
-    for method in of:
+    for method, reference in pairs:
         if method == reference or not (seeds := sorted(set(of[method]) & set(of[reference]))):
             continue
         ours, theirs = ({seed: of[name][seed] for seed in seeds} for name in (method, reference))
@@ -297,9 +303,7 @@ def _curves(ax: Axes, env: str, of: dict[str, dict[int, Curve]], measure: str) -
         at = ax.get_yaxis_transform()  # x as a share of the axis, y as it is
         ax.text(x, level, name, transform=at, fontsize=7, color="0.4", va="bottom", ha=side)
     ax.set(title=env, xlabel="million environment steps of training", ylabel=measure)
-    _finish(ax)
-    if measure == "return":
-        ax.set_ylim(auto=True)
+    _finish(ax, measure)
 
 
 def _ends(
@@ -314,14 +318,15 @@ def _ends(
         ax.errorbar(x, value, (value - low, high - value), label=method, capsize=3, **_style(i))
     ax.set_xticks(range(len(envs)), envs)
     ax.set(title="at the end", ylabel="coverage")
-    _finish(ax)
+    _finish(ax, "coverage")
 
 
 def _style(i: int) -> dict[str, Any]:
     return {"color": f"C{i % 10}", "linestyle": "-" if i < 10 else "--"}
 
 
-def _finish(ax: Axes) -> None:
-    ax.set_ylim(0, 1.02)
+def _finish(ax: Axes, measure: str) -> None:
+    if measure == "coverage":
+        ax.set_ylim(0, 1.02)
     ax.grid(alpha=0.25)
     ax.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))

@@ -30,7 +30,12 @@ TRACE_LENGTH = {"half_cheetah": 20, "walker2d": 20, "hopper": 20, "ant": 50, "hu
 TRPO_TRACE_LENGTH = TRACE_LENGTH | {"hopper": 10}
 REPORTS = 25  # per run
 BATCH = 4096  # steps of a TRPO update
-TEST_SEED = 10_000  # other first states than in training
+SEEDS = 1000  # environments of one run have seeds of their own, which no other run has
+# Without contact forces: zero nearly always, they are no part of what a model can unroll.
+PLAIN: dict[str, dict[str, Any]] = {
+    "ant": {"include_cfrc_ext_in_observation": False},
+    "humanoid": {"include_cfrc_ext_in_observation": False},
+}
 
 
 @dataclass(frozen=True)
@@ -97,7 +102,9 @@ def from_command_line(argv: list[str]) -> LocomotionConfig:
     cfg = parse(LocomotionConfig, argv, "python -m goalgan_bt.train", default)
     for names, good, what in (
         ("total_steps num_envs episodes hidden minibatch", lambda x: x >= 1, "1 or more"),
-        ("seed", lambda x: x >= 0, "0 or more"),
+        ("hidden minibatch episodes", lambda x: x <= 10_000, "at most 10000"),
+        ("num_envs", lambda x: x < SEEDS, f"less than {SEEDS}"),
+        ("seed", lambda x: 0 <= x <= 10**6, "between 0 and 1000000"),
     ):
         if bad := fault(cfg, names, good, what):
             raise UsageError(bad)
@@ -107,7 +114,8 @@ def from_command_line(argv: list[str]) -> LocomotionConfig:
 
 
 def train(cfg: LocomotionConfig, folder: Path) -> float:
-    """Learn to run; writes `metrics.csv` and `policy.pt` (a state_dict) into the run folder.
+    """Learn to run; writes `metrics.csv` and `policy.pt` (the policy's state_dict, with TRPO also
+    mean and variance that its observations are normalised by) into the run folder.
 
     Args:
         cfg: settings.
@@ -131,15 +139,18 @@ def train(cfg: LocomotionConfig, folder: Path) -> float:
     except ImportError:
         raise UsageError('locomotion needs the extra sb3: pip install "goalgan_bt[sb3]"') from None
     torch.set_num_threads(1)
-    env: Any = make_vec_env(TASKS[cfg.env], cfg.num_envs, seed=cfg.seed)
-    test_env: Any = make_vec_env(TASKS[cfg.env], 1, seed=TEST_SEED + cfg.seed)
+    plain = PLAIN.get(cfg.env, {})
+    env: Any = make_vec_env(TASKS[cfg.env], cfg.num_envs, SEEDS * cfg.seed, env_kwargs=plain)
+    # The last of its seeds: other first states than in training.
+    test_env: Any = make_vec_env(TASKS[cfg.env], 1, SEEDS * (cfg.seed + 1) - 1, env_kwargs=plain)
     common: Any = {
         "seed": cfg.seed,
         "device": "cpu",
         "batch_size": cfg.minibatch,
         "policy_kwargs": {
             "net_arch": [cfg.hidden, cfg.hidden],
-            "optimizer_kwargs": {"fused": True},
+            # Stable-Baselines3's own epsilon of each, which it forgets where anything is given.
+            "optimizer_kwargs": {"fused": True, "eps": 1e-5 if cfg.method == "trpo" else 1e-8},
         },
     }
     if cfg.method == "trpo":  # as rllab's, it sees normalised observations
@@ -177,7 +188,12 @@ def train(cfg: LocomotionConfig, folder: Path) -> float:
         records.metrics(row)
         left = seconds * max(0.0, cfg.total_steps / agent.num_timesteps - 1)
         say(f"steps {agent.num_timesteps:,}  return {mean:.1f}  left {left / 60:.0f} min")
-    state = agent.policy.state_dict()
+    state = {"policy": agent.policy.state_dict()}
+    if cfg.method == "trpo":  # what its observations are normalised by
+        state |= {
+            "mean": torch.from_numpy(env.obs_rms.mean),
+            "var": torch.from_numpy(env.obs_rms.var),
+        }
     record.write_atomically(folder / "policy.pt", lambda file: torch.save(state, file))
     records.close("complete")
     return mean
@@ -191,6 +207,6 @@ def main() -> int:
         folder = record.new_run(cfg.out, cfg.env, cfg.seed, asdict(cfg))
         say(f"run folder: {folder}")
         found = train(cfg, folder)
-        say(f"return {found:.1f} after {cfg.total_steps:,} training steps: {folder}")
+        say(f"return {found:.1f} at the end of training: {folder}")
 
     return exit_code(work)

@@ -32,13 +32,15 @@ from goalgan_bt.rollout import Float32
 from goalgan_bt.settings import BacktrackingConfig, RecallConfig
 
 EDGE = 0.999  # of the range of a squashed action, beyond which its inverse is taken as there
+MOST = 5.0  # standard deviations from the mean at which a number of an observation is cut off
 FAR = 3.0  # root mean square of the standard deviations from what was seen at which a trace ends
+WAYS = 4  # that a forward model imagines from a state; the best is imitated
 KL_SAMPLE = 1024  # states on which the KL of an imitation is bounded
 
 
 class Trajectory(NamedTuple):
-    """One episode: observations (T + 1, obs_dim), actions (T, act_dim) in [-1, 1], rewards (T,),
-    and whether its last state ended it, or time ran out."""
+    """One episode: observations as the environment gave them (T + 1, obs_dim), actions
+    (T, act_dim) in [-1, 1], rewards (T,), and whether its last state ended it, or time ran out."""
 
     obs: FloatArray
     actions: FloatArray
@@ -47,15 +49,17 @@ class Trajectory(NamedTuple):
 
 
 class Seen:
-    """The observations of an agent as states: valid is what is not far from those seen."""
+    """The observations of an agent as states: valid is what is not far from those seen. Numbers
+    far out are cut off: contact forces, zero nearly always, would break the model."""
 
     def __init__(self, obs: FloatArray, act_dim: int) -> None:
         self.state_dim, self.act_dim = obs.shape[1], act_dim
         self._mean, self._std = obs.mean(axis=0), obs.std(axis=0) + 1e-3
+        self._low, self._high = self._mean - MOST * self._std, self._mean + MOST * self._std
 
     def repair(self, states: FloatArray) -> FloatArray:
-        """Nothing is known of what makes an observation right."""
-        return states
+        """The same with numbers far out cut off."""
+        return np.clip(states, self._low, self._high)
 
     def valid(self, states: FloatArray) -> BoolArray:
         """Whether each state (n, state_dim) is finite and not far away, (n,)."""
@@ -90,6 +94,7 @@ class RecallTraces(BaseCallback):
             raise ValueError(problem)
         self.trajectories: deque[Trajectory] = deque()
         self.dynamics: BacktrackingModel | ForwardModel | None = None
+        self._seed = seed
         self._rng, self._noise = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
         self._remembered, self._turned = 0, 0
         self._moments: dict[str, Any] | None = None  # of a saved optimiser
@@ -99,9 +104,11 @@ class RecallTraces(BaseCallback):
 
     def _new_model(self, obs_dim: int, act_dim: int) -> BacktrackingModel | ForwardModel:
         cfg = BacktrackingConfig(batch=256, steps=self.cfg.model_steps)
-        if self.cfg.model == "forward":
-            return ForwardModel(obs_dim, act_dim, cfg, self._noise)
-        return BacktrackingModel(obs_dim, act_dim, 0, cfg, self._noise)
+        with torch.random.fork_rng(devices=[]):  # the agent's own noise stays as it would be alone
+            torch.manual_seed(self._seed)
+            if self.cfg.model == "forward":
+                return ForwardModel(obs_dim, act_dim, cfg, self._noise)
+            return BacktrackingModel(obs_dim, act_dim, 0, cfg, self._noise)
 
     def _init_callback(self) -> None:
         policy: Any = self.model.policy
@@ -134,21 +141,38 @@ class RecallTraces(BaseCallback):
             self._turned = 0
             for path in self._paths:
                 path.clear()
+        self._normalising = self.model.get_vec_normalize_env()
+        self._now = self._original(self.model._last_obs)
+
+    def _original(self, obs: Any) -> FloatArray:
+        """The last observations as the environments gave them: what an agent that normalises has
+        seen would look different by the time that it is recalled."""
+        known = obs if self._normalising is None else self._normalising.get_original_obs()
+        return np.array(known)
+
+    def _normalised(self, obs: FloatArray) -> FloatArray:
+        """Observations (n, obs_dim) as the agent sees them at present."""
+        if self._normalising is None:
+            return obs
+        return np.asarray(self._normalising.normalize_obs(obs))
 
     def _on_step(self) -> bool:
         given = self.locals
         actions = given.get("clipped_actions", given["actions"])
         told = self._told(actions)
-        normalising = self.model.get_vec_normalize_env()
-        rewards = given["rewards"] if normalising is None else normalising.get_original_reward()
-        last_obs: Any = self.model._last_obs
+        normalising, rewards = self._normalising, given["rewards"]
+        if normalising is not None:
+            rewards = normalising.get_original_reward()
         for i, path in enumerate(self._paths):
-            path.append((last_obs[i].copy(), told[i], float(rewards[i])))
+            path.append((self._now[i], told[i], float(rewards[i])))
             if given["dones"][i]:
                 info = given["infos"][i]
-                timeout = info.get("TimeLimit.truncated", False)
-                self._remember(path, info["terminal_observation"], not timeout)
+                last, timeout = info["terminal_observation"], info.get("TimeLimit.truncated", False)
+                if normalising is not None:
+                    last = normalising.unnormalize_obs(last)
+                self._remember(path, last, not timeout)
                 path.clear()
+        self._now = self._original(given["new_obs"])
         return True
 
     def _remember(
@@ -187,35 +211,43 @@ class RecallTraces(BaseCallback):
         """One turn of Algorithm 1 besides the agent's own: train the model, recall, imitate.
 
         Returns:
-            threshold: L; action_nll, state_nll, or forward_nll: see the models; valid: share of the
-            steps of the traces before they ended; loss, kl, log_pi: see `_imitate`; log_ratio:
-            log pi(a | s) - log q(a | s') before it, nats per step: of the paper's lower bound of
-            log p(R > L) (section 4) the part that is known; the world's transitions are not.
-            Nothing while there is too little to learn from.
+            threshold: L; length, best_length: mean actions of all remembered trajectories, and of
+            those that teach; action_nll, state_nll, or forward_nll: see the models; valid: share
+            of the steps of the traces before they ended; loss, kl, log_pi: see `_imitate`;
+            log_ratio: log pi(a | s) - log q(a | s') before it, nats per step: of the paper's lower
+            bound of log p(R > L) (section 4) the part that is known; the world's transitions are
+            not. Nothing while there is too little to learn from.
         """
         chosen, threshold = self.best()
         total = sum(len(one.rewards) for one in chosen)
         if total < self.cfg.min_steps:
             return {}
         states, following = (
-            np.concatenate([one.obs[rows] for one in chosen])
+            self._normalised(np.concatenate([one.obs[rows] for one in chosen]))
             for rows in (slice(-1), slice(1, None))
         )
         actions = np.concatenate([one.actions for one in chosen])
         rewards = np.concatenate([one.rewards for one in chosen])
+        if self._normalising is not None:  # as the critic's
+            rewards = self._normalising.normalize_reward(rewards)
+        lengths = {
+            "length": float(np.mean([len(one.rewards) for one in self.trajectories])),
+            "best_length": total / len(chosen),
+        }
         space = Seen(states, actions.shape[1])
+        known, after = space.repair(states), space.repair(following)
         data_cfg = BacktrackingConfig(buffer=total, min_transitions=1)
         data = Transitions(space.state_dim, space.act_dim, 0, data_cfg)
-        data.add(states, actions, following, np.empty((total, 0)), np.zeros(total))
+        data.add(known, actions, after, np.empty((total, 0)), np.zeros(total))
         model = self.dynamics
         assert model is not None
         if isinstance(model, ForwardModel):
-            metrics = {"threshold": threshold, **model.fit(data)}
-            told, done, valid = self._imagine(model, space, states)
+            metrics = {"threshold": threshold, **lengths, **model.fit(data)}
+            told, done, valid = self._imagine(model, space, known)
             metrics["valid"] = float(valid.mean())
             return metrics | (self._imitate(told, done, states) if len(told) else {})
         model.seen = 0  # none of it is held out: it may have been there before
-        metrics = {"threshold": threshold, **model.fit(data)}
+        metrics = {"threshold": threshold, **lengths, **model.fit(data)}
 
         worth = rewards
         if self.cfg.seeds == "value":  # of reaching a state: where it ends, nothing follows
@@ -223,14 +255,14 @@ class RecallTraces(BaseCallback):
             future = self._values(following)
             future[ends[[one.terminated for one in chosen]]] = 0.0
             worth = rewards + self._agent.gamma * future
-        seeds = following[np.argsort(worth)[-self.cfg.traces :]].astype(float)
+        seeds = after[np.argsort(worth)[-self.cfg.traces :]].astype(float)
         nowhere = np.empty((len(seeds), 0))
         traces = recall_traces(model, space, seeds, nowhere, self.cfg.trace_length)
         metrics["valid"] = float(traces.valid.mean())
         if traces.valid.any():
-            after = np.concatenate([seeds[None], traces.states[:-1]])[traces.valid]
+            later = np.concatenate([seeds[None], traces.states[:-1]])[traces.valid]
             recalled = traces.states[traces.valid], traces.actions[traces.valid]
-            happened = (torch.from_numpy(x).float() for x in (after, recalled[1]))
+            happened = (torch.from_numpy(x).float() for x in (later, recalled[1]))
             log_q = model.action_log_density(*happened).mean().item()
             metrics |= self._imitate(*recalled, states)
             metrics["log_ratio"] = metrics["log_pi"] - log_q
@@ -239,13 +271,16 @@ class RecallTraces(BaseCallback):
     def _imagine(
         self, model: ForwardModel, space: Seen, states: FloatArray
     ) -> tuple[Float32, Float32, BoolArray]:
-        """Let the policy act in a forward model from some of the states (m, obs_dim).
+        """Let the policy act in a forward model, `WAYS` times from each of some of the states
+        (m, obs_dim). The best is kept of those that have the same beginning: otherwise it would be
+        the beginnings that are chosen.
 
         Returns:
-            States and actions in [-1, 1] of the half that ends best, (n, obs_dim), (n, act_dim);
-            which of all steps were valid, (trace_length, traces).
+            States and actions in [-1, 1] of those that end best, (n, obs_dim), (n, act_dim); which
+            of all steps were valid, (trace_length, WAYS * traces).
         """
-        now = states[self._rng.integers(len(states), size=self.cfg.traces)]
+        begins = states[self._rng.integers(len(states), size=self.cfg.traces)]
+        now = np.tile(begins, (WAYS, 1))
         told = np.empty((self.cfg.trace_length, *now.shape), np.float32)
         done = np.empty((*told.shape[:2], space.act_dim), np.float32)
         valid = np.empty(told.shape[:2], dtype=bool)
@@ -255,9 +290,10 @@ class RecallTraces(BaseCallback):
             following = model.successors(*map(torch.from_numpy, (told[t], done[t]))).numpy()
             going &= space.valid(following)
             valid[t] = going
-            now = np.where(going[:, None], following, now)
-        worth = self._values(now)
-        kept = valid & (worth >= np.median(worth))
+            now = np.where(going[:, None], space.repair(following), now)
+        worth = self._values(now).reshape(WAYS, -1)
+        best = np.arange(WAYS)[:, None] == worth.argmax(axis=0)
+        kept = valid & best.ravel()
         return told[kept], done[kept], valid
 
     def _gaussian(self, obs: Tensor) -> Normal:
@@ -336,7 +372,9 @@ class RecallTraces(BaseCallback):
             miss.backward()
             self._optimiser.step()
             with torch.no_grad():
-                new_kl = kl_divergence(old, self._gaussian(reference)).sum(dim=1).mean().item()
+                new_kl = np.inf
+                if all(torch.isfinite(param).all() for param in params):
+                    new_kl = kl_divergence(old, self._gaussian(reference)).sum(dim=1).mean().item()
                 if not new_kl <= self.cfg.max_kl:
                     for param, value in zip(params, known, strict=True):
                         param.copy_(value)

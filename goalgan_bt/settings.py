@@ -206,8 +206,8 @@ class RecallConfig:
 
     model: Literal["backward", "forward"] = "backward"
     """What is learned: the backtracking model, or a control (the paper's appendix, after Dyna): a
-    forward model, in which the policy acts; it imitates the better half of what it imagines, by
-    the critic's value of where that ends."""
+    forward model, in which the policy acts; of four ways that it imagines from a state it imitates
+    the one that ends best, by the critic's value."""
     trace_length: int = 20
     """Steps of a recall trace (paper: 20; with TRPO Hopper 10; Ant and Humanoid 50)."""
     traces: int = 64
@@ -242,6 +242,11 @@ class RecallConfig:
         for name in (*counts.split(), "learning_rate", "max_kl", "top_percent"):
             if not getattr(self, name) > 0:
                 return f"{name} must be greater than 0, not {getattr(self, name)}"
+            if name in counts.split() and not isinstance(getattr(self, name), int):
+                return f"{name} must be a whole number, not {getattr(self, name)}"
+        for name, choices in (("model", "backward forward"), ("seeds", "value reward")):
+            if getattr(self, name) not in choices.split():
+                return f"{name} must be one of {choices}, not {getattr(self, name)!r}"
         if self.top_percent > 100:
             return f"top_percent must be at most 100, not {self.top_percent}"
         least = 1 if self.model == "forward" else 0  # a random one is a control of the other only

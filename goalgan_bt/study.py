@@ -5,7 +5,7 @@
 A study is a small TOML file: environments (with flags of their own: "point_nd --dim 4"), a number
 of seeds, flags for all, and methods by name, each with the flags of `goalgan_bt.train` that make
 it. Every run is a process of one thread. What is finished stands in `runs.csv` and is not run
-again; what was cut off goes on from its checkpoint.
+again; what was cut off goes on from its checkpoint, where its learner leaves any.
 """
 
 import os
@@ -17,6 +17,8 @@ if __name__ == "__main__":  # nothing is lost: what is finished is on disk, the 
 
 import csv
 import fcntl
+import json
+import math
 import re
 import shlex
 import subprocess
@@ -24,7 +26,7 @@ import time
 import tomllib
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -73,7 +75,8 @@ class StudyConfig:
 
     study: tyro.conf.Positional[str]
     """A TOML file, or one of those that come along: point_umaze, ant_umaze, point_nd, ablations,
-    four_rooms, four_rooms_ablations, locomotion_trpo, locomotion_sac."""
+    four_rooms, four_rooms_ablations, locomotion_trpo, locomotion_sac, locomotion_lengths,
+    locomotion_forward, locomotion_random, locomotion_updates."""
     out: Path = Path("docs/studies")
     """Where tables and report go, in a folder with the study's name."""
     runs: Path = Path("runs/studies")
@@ -122,7 +125,10 @@ def load(name: str) -> Study:
     if bad := [name for name in table["methods"] if not re.fullmatch(r"\w[\w.+-]*", name)]:
         raise UsageError(f"{wrong}a method's name is letters, digits, _ . + -, not {bad[0]!r}")
     seeds = range(first, first + table["seeds"])
-    measures = {measure(env) for env in table["envs"]}
+    try:
+        measures = {measure(env) for env in table["envs"]}
+    except ValueError as error:
+        raise UsageError(f"{wrong}{error}") from None
     if len(measures) > 1:
         raise UsageError(f"{wrong}some of its environments have a coverage, others a return")
     study = Study(path.stem, table["envs"], table["methods"], seeds, flags, measures.pop())
@@ -193,6 +199,8 @@ def perform(run: Run, folder: Path) -> Path:
         if ended.exists() and ended.read_text().startswith("complete"):
             return place
         flags = ["--resume", str(place), "--viz", "none"]
+    elif whole := [end.parent for end in folder.glob(f"*/{record.ENDED}") if _of(end.parent, run)]:
+        return whole[-1]  # of a learner that leaves no checkpoint
     folder.mkdir(parents=True, exist_ok=True)
     done = subprocess.run(
         [sys.executable, "-m", "goalgan_bt.train", *flags],
@@ -206,6 +214,17 @@ def perform(run: Run, folder: Path) -> Path:
         last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
         raise record.RunError(f"{run.env}, {run.method}, seed {run.seed} failed: {last}")
     return max(folder.glob("*/config.json"), key=os.path.getmtime).parent
+
+
+def _of(place: Path, run: Run) -> bool:
+    """Whether a complete run folder was made with the settings of a run."""
+    try:
+        made = json.loads((place / "config.json").read_text())
+        complete = (place / record.ENDED).read_text().startswith("complete")
+    except (OSError, ValueError):
+        return False
+    asked = json.loads(json.dumps(asdict(settings(run)), default=str))
+    return complete and {**made, "out": None} == {**asked, "out": None}
 
 
 class Tables:
@@ -228,12 +247,12 @@ class Tables:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise record.RunError(f"{folder} is another study's at work: wait for it") from None
-        self.costs = _read(folder / "costs.csv", COSTS)
-        # Costs are written last: what has none was cut off between the two.
+        curves = _read(folder / "runs.csv", self._columns)
+        # What is not in both was cut off between the two, or is damaged: it is run again.
+        begun = {_key(row) for row in curves}
+        self.costs = [row for row in _read(folder / "costs.csv", COSTS) if _key(row) in begun]
         known = {_key(row) for row in self.costs}
-        self.curves = [
-            row for row in _read(folder / "runs.csv", self._columns) if _key(row) in known
-        ]
+        self.curves = [row for row in curves if _key(row) in known]
 
     def has(self, run: Run) -> bool:
         """Whether a run is finished.
@@ -257,6 +276,8 @@ class Tables:
         key = dict(zip(KEY, run.key, strict=True))
         found = [(row["steps/train"], row.get(f"eval/{self.measure}")) for row in rows]
         reports = [(steps, value) for steps, value in found if value]
+        if not reports:
+            raise record.RunError(f"{folder} has measured no {self.measure}: remove it")
         self.curves += [key | {"steps": steps, self.measure: value} for steps, value in reports]
         last = rows[-1]
         self.costs.append(
@@ -277,10 +298,18 @@ def _key(row: dict[str, str]) -> tuple[str, ...]:
 def _read(path: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
     if not path.exists():
         return []
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    if any(set(row) != set(columns) or None in row.values() for row in rows):
-        raise record.RunError(f"{path} is damaged: its columns must be {', '.join(columns)}")
+    numbers = [name for name in columns if name not in ("env", "method", "flags", "commit")]
+    try:
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        if any(set(row) != set(columns) or None in row.values() for row in rows):
+            raise ValueError(f"its columns must be {', '.join(columns)}")
+        for row in rows:
+            if not all(math.isfinite(float(row[name])) for name in numbers):
+                raise ValueError(f"a number in the row of {', '.join(_key(row))} is not finite")
+            int(row["seed"])
+    except ValueError as error:  # UnicodeDecodeError is one
+        raise record.RunError(f"{path} is damaged: {error}") from None
     return rows
 
 

@@ -34,7 +34,9 @@ def test_a_run_of_the_hopper(method, steps, tmp_path):
     assert int(rows[-1]["steps/train"]) >= steps
     assert [int(row["iteration"]) for row in rows] == list(range(1, len(rows) + 1))
     assert float(rows[-1]["eval/return"]) > 0 and float(rows[-1]["recall/kl"]) >= 0
-    weights = torch.load(folder / "policy.pt", weights_only=True)
+    saved = torch.load(folder / "policy.pt", weights_only=True)
+    weights = saved["policy"]
+    assert ("mean" in saved) == (method == "trpo")
     assert any(name.startswith(("actor", "action_net")) for name in weights)
     drawn = run_module("plot", folder)
     assert drawn.returncode == 0 and (folder / "coverage.png").stat().st_size > 10_000

@@ -208,21 +208,64 @@ def test_the_log_density_is_that_of_the_model():
 
 @pytest.mark.parametrize("name", ["SAC", "PPO"])
 def test_the_forward_control_imitates_what_it_imagined_to_end_well(name, monkeypatch):
-    callback = recall(model="forward", traces=20, model_steps=200)
+    callback = recall(model="forward", traces=60, model_steps=200)
     model = agent(name, make_vec_env(Reach, n_envs=1, seed=0))
     model.learn(1600, callback=callback)
     assert {"forward_nll", "valid", "loss", "kl"} <= set(callback.last)
-    # In a model in which nothing stands in the way: places add up, and the left half is forgotten.
+    # In a model in which nothing stands in the way: places add up, and it is good to be right.
     monkeypatch.setattr(callback.dynamics, "successors", lambda s, a: s + 0.1 * a)
     monkeypatch.setattr(callback, "_values", lambda obs: obs[:, 0])
     space = Seen(np.random.default_rng(0).uniform(-1, 1, (500, 2)), 2)
-    begins = np.random.default_rng(1).uniform(-0.5, 0.5, (50, 2)).astype(np.float32)
-    states, actions, valid = callback._imagine(callback.dynamics, space, begins)
-    assert valid.shape == (5, 20) and valid.all() and len(states) == len(actions) == 5 * 10
-    paths, moves = states.reshape(5, 10, 2), actions.reshape(5, 10, 2)
-    assert abs(moves).max() <= 1 and moves.std() > 0.1
-    np.testing.assert_allclose(paths[1:], paths[:-1] + 0.1 * moves[:-1], rtol=1e-5, atol=1e-6)
-    assert paths[-1, :, 0].mean() > begins[:, 0].mean()
+
+    def ends(ways):
+        """How far to the right it gets on the mean, always from the same place."""
+        monkeypatch.setattr(sb3, "WAYS", ways)
+        begins = np.full((1, 2), 0.1, np.float32)
+        states, actions, valid = callback._imagine(callback.dynamics, space, begins)
+        assert valid.shape == (5, 60 * ways) and valid.all() and abs(actions).max() <= 1
+        paths, moves = states.reshape(5, 60, 2), actions.reshape(5, 60, 2)
+        np.testing.assert_allclose(paths[1:], paths[:-1] + 0.1 * moves[:-1], rtol=1e-5, atol=1e-6)
+        return (paths[-1] + 0.1 * moves[-1])[:, 0].mean()
+
+    assert ends(4) > ends(1) + 0.03  # the actions are chosen, not the places
+
+
+def learned_without(callback, name):
+    """The first weights of an agent after two rollouts, in which nothing is recalled yet."""
+    model = agent(name, make_vec_env(Reach, n_envs=2, seed=0))
+    model.learn(300, callback=callback)
+    return torch.cat([param.flatten() for param in model.policy.parameters()])
+
+
+@pytest.mark.parametrize("name", ["SAC", "PPO"])
+def test_before_the_first_turn_an_agent_is_what_it_is_alone(name):
+    callback = recall(every=10**6)
+    assert torch.equal(learned_without(callback, name), learned_without(None, name))
+    twin = recall(every=10**6)
+    torch.rand(7)
+    learned_without(twin, name)
+    pairs = zip(callback.dynamics.parameters(), twin.dynamics.parameters(), strict=True)
+    assert all(torch.equal(ours, theirs) for ours, theirs in pairs)
+
+
+@pytest.mark.parametrize("name", ["SAC", "PPO"])
+def test_what_is_remembered_is_not_normalised(name, monkeypatch):
+    """Under VecNormalize: observations as they were, the critic's units where values are added."""
+    env = VecNormalize(make_vec_env(Reach, n_envs=2, seed=0))
+    callback, model = recall(), agent(name, env)
+    model.learn(2000, callback=callback)
+    for one in callback.trajectories:
+        moved = np.diff(one.obs, axis=0)
+        np.testing.assert_allclose(one.rewards, -np.abs(one.obs[1:]).sum(axis=1), atol=1e-4)
+        inside = (np.abs(one.obs[1:]) < 1.99).all(axis=1)
+        scaled = one.actions * FASTEST
+        np.testing.assert_allclose(moved[inside], scaled[inside], atol=1e-4)
+    told = []
+    monkeypatch.setattr(callback, "_values", lambda obs: told.append(obs) or np.zeros(len(obs)))
+    callback.turn()
+    chosen, _ = callback.best()
+    after = np.concatenate([one.obs[1:] for one in chosen])
+    np.testing.assert_allclose(told[0], env.normalize_obs(after))
 
 
 def test_traces_begin_where_it_pays_to_be(monkeypatch):

@@ -147,7 +147,33 @@ def test_a_study_of_returns(tmp_path):
     assert sorted({int(row["steps"]) for row in rows}) == [4096, 8192]
     report = (tmp_path / "run/README.md").read_text()
     assert "| recall_traces less trpo | 2 |" in report and "to 0.63" not in report
-    assert (tmp_path / "run/curves.png").stat().st_size > 10_000
+    # A finished run leaves no checkpoint, and is only read in all the same.
+    made = sorted((tmp_path / "runs").glob("*/*/*/*/ended.txt"))
+    for name in ("runs.csv", "costs.csv"):
+        lines = (tmp_path / f"run/{name}").read_text().splitlines(keepends=True)
+        (tmp_path / f"run/{name}").write_text(
+            "".join(line for line in lines if ",trpo,1," not in line)
+        )
+    again = run_module(*words)
+    assert again.returncode == 0 and "1 runs of 4 to go" in again.stdout
+    assert len(made) == 4 == len(sorted((tmp_path / "runs").glob("*/*/*/*/ended.txt")))
+    # In the picture there are the curves.
+    spec = study.load(str(tmp_path / "run.toml"))
+    drawn = evidence.draw(spec, evidence.curves(study.Tables(tmp_path / "run", "return")))
+    low, high = drawn.axes[0].get_ylim()
+    returns = [float(row["return"]) for row in rows]
+    assert low < min(returns) and high > np.mean(returns)
+
+
+@pytest.mark.parametrize("value", ["abc", "nan", ""])
+def test_a_damaged_table_is_one_line(finished, value, tmp_path):
+    root, _ = finished
+    out = shutil.copytree(root / "out", tmp_path / "out")
+    text = (out / "tiny/runs.csv").read_text().rstrip()
+    (out / "tiny/runs.csv").write_text(text[: text.rindex(",") + 1] + value + "\n")
+    done = run_module("study", root / "tiny.toml", "--out", out, "--report")
+    assert done.returncode == 2 and "runs.csv is damaged" in done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 def test_differences_are_paired_by_seed():
@@ -157,7 +183,7 @@ def test_differences_are_paired_by_seed():
         name: {seed: Curve(steps, np.array([0.0, more + 100 * seed])) for seed in range(3)}
         for name, more in (("recall_traces", 10.0), ("trpo", 0.0))
     }
-    *_, line = evidence._differences(of)
+    *_, line = evidence._differences(of)[:5]
     assert line == "| recall_traces less trpo | 3 | 5.00 [5.00, 5.00] | 10 [10, 10] |"
     assert evidence.area(Curve(steps[:1], np.array([7.0]))) == 7.0
 

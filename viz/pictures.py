@@ -44,6 +44,7 @@ def curve(ax: Axes, folders: list[Path], until: int | None = None) -> None:
         values = [float(row[f"eval/{measure}"]) for row in rows]
         values[known:] = [math.nan] * (len(rows) - known)
         run = Run(folder)
+        ax.update_datalim([(x, 0.0) for x in steps], updatey=False)
         ax.plot(steps, values, color=f"C{i}", label=_title(run), marker=".", markersize=4)
         references |= dict.fromkeys(published(run.settings))
     for line, grey in zip(references, ("0.65", "0.35") * 9, strict=False):
@@ -54,7 +55,7 @@ def curve(ax: Axes, folders: list[Path], until: int | None = None) -> None:
     if measure == "coverage":
         ax.set_ylim(0, 1.02)
     ax.grid(alpha=0.25)
-    ax.legend(fontsize=7, frameon=False, loc="best")
+    ax.legend(fontsize=7, frameon=False, loc="upper left" if measure == "coverage" else "best")
 
 
 def _title(run: Run) -> str:
