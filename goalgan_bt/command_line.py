@@ -70,13 +70,23 @@ def fault(cfg: Any, names: str, good: Callable[[Any], bool], what: str) -> str |
 def exit_code(work: Callable[[], None]) -> int:
     """Do some work; whatever its user can mend is told in one line, with exit code 2, or 130 for
     Ctrl-C."""
+    asked = signal.SIGINT
+
+    def stop(number: int, _: object) -> None:
+        nonlocal asked
+        asked = signal.Signals(number)
+        raise KeyboardInterrupt
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.default_int_handler)
+        signal.signal(number, stop)
     try:
         work()
     except KeyboardInterrupt:
         complain("interrupted: what was measured is in the run folder; start again")
-        return 130
+        return 130 if asked == signal.SIGINT else 2
+    except MemoryError:
+        complain("out of memory: use smaller settings")
+        return 2
     except OSError as error:
         full = error.errno == errno.ENOSPC
         complain("the disk is full: free some space" if full else str(error))

@@ -249,5 +249,7 @@ class RecallConfig:
                 return f"{name} must be one of {choices}, not {getattr(self, name)!r}"
         if self.top_percent > 100:
             return f"top_percent must be at most 100, not {self.top_percent}"
+        if self.capacity * self.top_percent / 100 < self.min_steps:
+            return "min_steps is more than top_percent of capacity: nothing would ever be recalled"
         least = 1 if self.model == "forward" else 0  # a random one is a control of the other only
         return None if self.model_steps >= least else f"model_steps must be {least} or more"

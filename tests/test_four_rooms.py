@@ -2,6 +2,10 @@
 
 import csv
 import json
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -179,6 +183,19 @@ def test_a_run_from_its_flags_to_its_figures(tmp_path):
         assert [row["eval/return"] for row in csv.DictReader(file)] == [
             row["eval/return"] for row in rows
         ]
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 2)])
+def test_a_run_that_is_stopped_says_so(number, code, tmp_path):
+    flags = "--env", "four_rooms_19", "--total-steps", "100000000", "--out", tmp_path
+    words = [sys.executable, "-m", "goalgan_bt.train", *map(str, flags)]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as running:
+        while not list(tmp_path.glob("*/metrics.csv")):
+            time.sleep(0.1)
+        running.send_signal(number)
+        _, said = running.communicate(timeout=20)
+    assert running.returncode == code and said.startswith("error: interrupted")
+    assert said.count("\n") == 1
 
 
 def test_larger_rooms_need_recall_traces(tmp_path):

@@ -111,7 +111,7 @@ def test_rewards_are_the_environments_own_where_they_are_normalised():
 
 
 def test_the_threshold_is_a_percentile_and_the_memory_has_an_end():
-    callback = RecallTraces(RecallConfig(top_percent=20, capacity=100))
+    callback = RecallTraces(RecallConfig(top_percent=20, capacity=100, min_steps=20))
     for i in range(50):
         path = [(np.zeros(2), np.zeros(2), float(i % 10))] * 5
         callback._remember(path, np.zeros(2), False)
@@ -287,7 +287,18 @@ def test_traces_begin_where_it_pays_to_be(monkeypatch):
     np.testing.assert_allclose(begun, [obs[-2], obs[-1]])
 
 
-@pytest.mark.parametrize("bad", [{"top_percent": 200}, {"traces": 0}, {"every": -1}])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"top_percent": 200},
+        {"traces": 0},
+        {"every": -1},
+        {"capacity": 1000},
+        {"model": "forwards"},
+        {"seeds": "values"},
+        {"trace_length": 2.5},
+    ],
+)
 def test_settings_that_make_no_sense_are_refused(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         RecallTraces(RecallConfig(**bad))
