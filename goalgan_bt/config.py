@@ -210,16 +210,14 @@ def check(cfg: Config) -> None:
         "discount gae_lambda rollout.chain goals.anywhere goals.r_min goals.r_max "
         "trpo.fisher_fraction trpo.line_search_decay"
     )
+    numbers = f"{above_zero} {not_negative}".split()
+    bounded = " ".join(name for name in numbers if name != "goals.near")
     for names, good, what in (
         (above_zero, lambda x: x > 0, "greater than 0"),
         (not_negative, lambda x: x >= 0, "0 or more"),
         (shares, lambda x: 0 <= x <= 1, "between 0 and 1"),
-        (f"{above_zero} {not_negative}", lambda x: x <= 1e12 or x == math.inf, "a sane number"),
-        (
-            f"{above_zero} {not_negative}".replace("goals.near", ""),
-            lambda x: x < math.inf,
-            "finite",
-        ),
+        (" ".join(numbers), lambda x: x <= 1e12 or x == math.inf, "a sane number"),
+        (bounded, lambda x: x < math.inf, "finite"),
     ):
         if bad := fault(cfg, names, good, what):
             raise ConfigError(bad)

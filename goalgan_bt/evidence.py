@@ -249,7 +249,9 @@ def _ratios(of: dict[str, dict[int, Curve]]) -> list[str]:
 def _differences(of: dict[str, dict[int, Curve]]) -> list[str]:
     reference = next((method for method in REFERENCES if method in of), next(iter(of)))
     pairs = [(method, reference) for method in of]
-    if "recall_traces" in of:  # whose controls are to be compared with it, too
+    if (
+        "recall_traces" in of and reference != "recall_traces"
+    ):  # whose controls are to be compared with it, too
         pairs += [("recall_traces", method) for method in of if method != reference]
     lines = []
     for method, reference in pairs:

@@ -241,13 +241,13 @@ class RecallTraces(BaseCallback):
         data.add(known, actions, after, np.empty((total, 0)), np.zeros(total))
         model = self.dynamics
         assert model is not None
+        if isinstance(model, BacktrackingModel):
+            model.seen = 0  # none of it is held out: it may have been there before
+        metrics = {"threshold": threshold, **lengths, **model.fit(data)}
         if isinstance(model, ForwardModel):
-            metrics = {"threshold": threshold, **lengths, **model.fit(data)}
             told, done, valid = self._imagine(model, space, known)
             metrics["valid"] = float(valid.mean())
             return metrics | (self._imitate(told, done, states) if len(told) else {})
-        model.seen = 0  # none of it is held out: it may have been there before
-        metrics = {"threshold": threshold, **lengths, **model.fit(data)}
 
         worth = rewards
         if self.cfg.seeds == "value":  # of reaching a state: where it ends, nothing follows

@@ -190,17 +190,14 @@ def perform(run: Run, folder: Path) -> Path:
         RunError: if training failed, with its last words, or was begun with other settings.
     """
     flags = [*words(run), "--out", str(folder)]
+    if whole := [end.parent for end in folder.glob(f"*/{record.ENDED}") if _of(end.parent, run)]:
+        return whole[-1]
     if begun := sorted(folder.glob("*/checkpoint.pt")):
         place = begun[-1].parent
         asked = settings(run)
         if replace(config.load(place), out=asked.out, resume=None) != asked:
             raise record.RunError(f"{place} was begun with other settings: remove it")
-        ended = place / record.ENDED
-        if ended.exists() and ended.read_text().startswith("complete"):
-            return place
         flags = ["--resume", str(place), "--viz", "none"]
-    elif whole := [end.parent for end in folder.glob(f"*/{record.ENDED}") if _of(end.parent, run)]:
-        return whole[-1]  # of a learner that leaves no checkpoint
     folder.mkdir(parents=True, exist_ok=True)
     done = subprocess.run(
         [sys.executable, "-m", "goalgan_bt.train", *flags],
@@ -217,14 +214,15 @@ def perform(run: Run, folder: Path) -> Path:
 
 
 def _of(place: Path, run: Run) -> bool:
-    """Whether a complete run folder was made with the settings of a run."""
+    """Whether a run folder is complete and was made with the settings of a run."""
     try:
         made = json.loads((place / "config.json").read_text())
         complete = (place / record.ENDED).read_text().startswith("complete")
     except (OSError, ValueError):
         return False
     asked = json.loads(json.dumps(asdict(settings(run)), default=str))
-    return complete and {**made, "out": None} == {**asked, "out": None}
+    free = {"out": None, "resume": None}
+    return complete and isinstance(made, dict) and {**made, **free} == {**asked, **free}
 
 
 class Tables:
