@@ -209,6 +209,8 @@ def read_metrics(folder: Path) -> tuple[list[str], list[dict[str, str]]]:
             rows = [row for row in reader if None not in row.values()]
             columns = list(reader.fieldnames or [])
     except OSError:
+        if (folder / "meta.json").exists():
+            raise RunError(f"{folder} has no report yet: wait for its first") from None
         raise RunError(f"{folder} is no run: it has no metrics.csv") from None
     except (csv.Error, UnicodeDecodeError) as error:
         raise RunError(f"{folder / 'metrics.csv'} is damaged: {error}") from None

@@ -100,6 +100,12 @@ def test_a_folder_that_is_no_run_says_so(tmp_path, read):
         read(tmp_path)
 
 
+def test_a_run_without_a_report_yet_says_so(tmp_path):
+    record.write_meta(tmp_path, mazes.layout("spiral"))
+    with pytest.raises(RunError, match="no report yet"):
+        record.read_metrics(tmp_path)
+
+
 def test_tensorboard_forgets_what_a_resumed_run_does_again(tmp_path):
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     first = Record(tmp_path)
