@@ -25,8 +25,7 @@ class PhysicsError(ValueError):
 class Step(NamedTuple):
     """What one action in n simulations gave.
 
-    states: (n, state_dim) afterwards; obs: (n, obs_dim) float32, those states as the policy sees
-    them.
+    states: (n, state_dim) afterwards.
     achieved: (n, goal_dim) the goals on which they stand.
     actions: (n, act_dim) what the body felt, in [-1, 1] (see `GoalEnv.to_body`).
     rewards: (n,) float32, 1 on reaching the goal, else 0.
@@ -35,7 +34,6 @@ class Step(NamedTuple):
     """
 
     states: FloatArray
-    obs: NDArray[np.float32]
     achieved: FloatArray
     actions: FloatArray
     rewards: NDArray[np.float32]
@@ -217,11 +215,10 @@ class GoalEnv:
         with np.errstate(invalid="ignore"):  # a diverged state is as far as can be
             achieved = self.achieved_goals(states)
             success = healthy & feasible & self.reached(achieved, goals)
-            obs = self.observations(states, goals, achieved)
         terminated = success | ~healthy
         truncated = ~terminated & (elapsed >= self.horizon)
         rewards = xp.asarray(success, dtype=xp.float32)
-        return Step(states, obs, achieved, actions, rewards, terminated, truncated)
+        return Step(states, achieved, actions, rewards, terminated, truncated)
 
 
 class MujocoEnv(GoalEnv):

@@ -64,7 +64,8 @@ def attempts(
         step = env.step(active, act(obs, drawn))
         yield active, step
         going = ~(step.terminated | step.truncated)
-        active, obs = active[going], step.obs[going]
+        active = active[going]
+        obs = env.observations(step.states[going], env.goals[active], step.achieved[going])
 
 
 def success_rate(

@@ -114,6 +114,7 @@ class Collector:
         self._total = ranks.size() * n
         self._mine = slice(ranks.rank() * n, (ranks.rank() + 1) * n)
         self._from_start = np.zeros(n, dtype=bool)
+        self._start_achieved = env.achieved_goals(env.start_state[None])
         # Every unfinished episode, action by action: successes are known only when they end.
         self._age = np.zeros(n, dtype=np.int64)  # actions since the episode began
         longest = math.ceil(env.horizon / env.action_repeat)
@@ -149,7 +150,9 @@ class Collector:
         noise = torch.randn(steps, self._total, env.act_dim, generator=self._noise)[:, self._mine]
         # For each step: a draw of whether the next episode is chained and of its goal.
         draws = self._rng.random((steps, 2, self._total))[..., self._mine]
-        truncated_obs = []
+        # Where truncated steps led, and where to they should have.
+        late_states: list[FloatArray] = [np.empty((0, env.state_dim))]
+        late_goals: list[FloatArray] = [np.empty((0, env.goal_dim))]
         ended: list[tuple[np.ndarray, ...]] = []  # Episodes' columns, with ids before them
         paths: list[tuple[int, Float32, Float32]] = []
         obs = env.observe(ids)
@@ -164,7 +167,7 @@ class Collector:
             self._terminated[t], self._truncated[t] = step.terminated, step.truncated
 
             done = np.flatnonzero(step.terminated | step.truncated)
-            obs = step.obs
+            states, achieved = step.states, step.achieved
             if len(done):
                 reached = step.rewards[done] > 0
                 fell = step.terminated[done] & ~reached
@@ -176,12 +179,15 @@ class Collector:
                     paths.append(
                         (i, self._states[: length + 1, i].copy(), self._actions[:length, i].copy())
                     )
-                truncated_obs.append(obs[step.truncated])
+                late_states.append(states[step.truncated])
+                late_goals.append(env.goals[step.truncated])
                 chained = ~fell & (draws[t, 0, done] < self.cfg.chain)
                 following = pick(goals, draws[t, 1, done])
                 self._chain(done[chained], following[chained])
-                self._reset(done[~chained], following[~chained])
-                obs[done] = env.observe(done)
+                anew = done[~chained]
+                self._reset(anew, following[~chained])
+                states[anew], achieved[anew] = env.start_state, self._start_achieved
+            obs = env.observations(states, env.goals, achieved)
 
         rollouts = Rollouts(
             self._obs,
@@ -190,7 +196,7 @@ class Collector:
             self._terminated,
             self._truncated,
             obs,
-            np.concatenate([np.empty((0, env.obs_dim), np.float32), *truncated_obs]),
+            env.observations(np.concatenate(late_states), np.concatenate(late_goals)),
             self._achieved,
         )
         return rollouts, self._episodes(ended, paths)
