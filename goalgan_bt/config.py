@@ -128,7 +128,7 @@ ANT = Config(
     updates=4,
     policy=PolicyConfig(init_std=0.2, final_std=0.07),
     rollout=RolloutConfig(num_envs=256, steps=50),
-    gan=GanConfig(steps=100, generator_hidden=(128, 128)),
+    gan=GanConfig(steps=50, generator_hidden=(128, 128)),
     backtracking=BacktrackingConfig(trace_length=50),
     imitation=ImitationConfig(steps=10, learning_rate=5e-5, max_kl=0.003, fade=0.3),
 )
