@@ -208,10 +208,15 @@ def read_metrics(folder: Path) -> tuple[list[str], list[dict[str, str]]]:
             reader = csv.DictReader(file)
             rows = [row for row in reader if None not in row.values()]
             columns = list(reader.fieldnames or [])
-    except OSError:
+    except FileNotFoundError:
         if (folder / "meta.json").exists():
-            raise RunError(f"{folder} has no report yet: wait for its first") from None
+            raise RunError(
+                f"{folder} holds no report yet: wait for its first one, "
+                "or start it again if it has ended"
+            ) from None
         raise RunError(f"{folder} is no run: it has no metrics.csv") from None
+    except OSError as error:
+        raise RunError(f"cannot read {folder / 'metrics.csv'}: {error}") from None
     except (csv.Error, UnicodeDecodeError) as error:
         raise RunError(f"{folder / 'metrics.csv'} is damaged: {error}") from None
     if columns and not all(row.get("iteration", "").isdigit() for row in rows):

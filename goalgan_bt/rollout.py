@@ -186,6 +186,7 @@ class Collector:
                 self._chain(done[chained], following[chained])
                 anew = done[~chained]
                 self._reset(anew, following[~chained])
+                # Both are copies of this step; what was reached is computed only once.
                 states[anew], achieved[anew] = env.start_state, self._start_achieved
             obs = env.observations(states, env.goals, achieved)
 

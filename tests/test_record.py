@@ -102,7 +102,7 @@ def test_a_folder_that_is_no_run_says_so(tmp_path, read):
 
 def test_a_run_without_a_report_yet_says_so(tmp_path):
     record.write_meta(tmp_path, mazes.layout("spiral"))
-    with pytest.raises(RunError, match="no report yet"):
+    with pytest.raises(RunError, match="holds no report yet"):
         record.read_metrics(tmp_path)
 
 

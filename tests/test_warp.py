@@ -155,6 +155,7 @@ def test_episodes_on_the_device_are_the_environments(worlds, name):
     host.reset(EVERYONE, goals)
     device.begin(torch.ones(N, dtype=torch.bool), torch.from_numpy(goals))
     for _ in range(14):
+        assert device.observe().dtype == torch.float32
         assert np.allclose(device.observe(), host.observe(EVERYONE), atol=1e-4)
         actions = rng.uniform(-1, 1, (N, host.act_dim)).astype(np.float32)
         there, here = device.step(torch.from_numpy(actions)), host.step(EVERYONE, actions)
