@@ -27,7 +27,7 @@ from common import machine
 
 from goalgan_bt import config
 from goalgan_bt.config import Config
-from goalgan_bt.train import train
+from goalgan_bt.train import Trained, train
 
 # Functions by phase, as they are looked up when they are called: a function that another module
 # has imported by name is wrapped there.
@@ -172,10 +172,17 @@ def profile(cfg: Config) -> str:
     """Train once; a table in Markdown of where the time went."""
     quiet(replace(cfg, total_steps=1), train)
     timers = Timers()
-    with wrapped(timers):
+    wall = cpu = 0.0
+
+    def timed(cfg: Config, folder: Path) -> Trained:  # without what becomes of the folder
+        nonlocal wall, cpu
         wall, cpu = time.perf_counter(), time.process_time()
-        steps = quiet(cfg, timers.wrap(train, REST))
+        trained = timers.wrap(train, REST)(cfg, folder)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        return trained
+
+    with wrapped(timers):
+        steps = quiet(cfg, timed)
     rows = [
         (phase, thread, f"{s.calls:,}", f"{s.wall:.2f}", f"{s.wall / wall:.1%}", f"{s.cpu:.2f}")
         for (phase, thread), s in sorted(timers.spent.items(), key=lambda item: -item[1].wall)
