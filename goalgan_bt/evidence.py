@@ -248,18 +248,17 @@ def _ratios(of: dict[str, dict[int, Curve]]) -> list[str]:
 
 def _differences(of: dict[str, dict[int, Curve]]) -> list[str]:
     reference = next((method for method in REFERENCES if method in of), next(iter(of)))
-    pairs = [(method, reference) for method in of]
-    if (
-        "recall_traces" in of and reference != "recall_traces"
-    ):  # whose controls are to be compared with it, too
-        pairs += [("recall_traces", method) for method in of if method != reference]
+    others = [method for method in of if method != reference]
+    pairs = [(method, reference) for method in others]
+    if "recall_traces" in others:  # its controls are compared with it, too
+        pairs += [("recall_traces", other) for other in others if other != "recall_traces"]
     lines = []
-    for method, reference in pairs:
-        if method == reference or not (seeds := sorted(set(of[method]) & set(of[reference]))):
+    for one, other in pairs:
+        if not (seeds := sorted(set(of[one]) & set(of[other]))):
             continue
-        ours, theirs = ({seed: of[name][seed] for seed in seeds} for name in (method, reference))
+        ours, theirs = ({seed: of[name][seed] for seed in seeds} for name in (one, other))
         cells = [paired(figure(ours) - figure(theirs)) for figure in (areas, ends)]
-        lines.append(f"| {method} less {reference} | {len(seeds)} | {cells[0]} | {cells[1]} |")
+        lines.append(f"| {one} less {other} | {len(seeds)} | {cells[0]} | {cells[1]} |")
     if not lines:
         return []
     heads = ["| difference | seeds | area | at the end |", "| --- | --- | --- | --- |"]
