@@ -176,11 +176,10 @@ def report(study: Study, tables: Tables) -> None:
         table = _markdown([here[method] for method in best_first])
         compared = _ratios(of) if study.measure == "coverage" else _differences(of)
         text += ["", f"## {env}", "", *table, "", *compared]
-    commits = sorted({row["commit"][:12] for row in tables.costs})
     text += [
         "",
         *(NOTES if study.measure == "coverage" else RETURN_NOTES).splitlines(),
-        f"Raw figures: runs.csv, costs.csv. Commit: {', '.join(commits)}.",
+        f"Raw figures: runs.csv, costs.csv. {_commits(tables.costs)}",
         "",
         f"![{study.measure} over training steps](curves.png)",
         "",
@@ -192,6 +191,20 @@ def report(study: Study, tables: Tables) -> None:
     record.write_atomically(
         tables.folder / "curves.png", lambda file: file.write(picture.getvalue())
     )
+
+
+def _commits(costs: list[dict[str, str]]) -> str:
+    """The commit of most runs, and which methods were run with others."""
+    methods: dict[str, list[str]] = {}
+    for row in costs:
+        commit, dirty = row["commit"][:12], "-dirty" * row["commit"].endswith("-dirty")
+        methods.setdefault(commit + dirty, []).append(row["method"])
+    most, *others = sorted(methods, key=lambda commit: -len(methods[commit]))
+    text = f"Commit: {most}"
+    for commit in others:
+        of = methods[commit]
+        text += f"; {commit} for {len(of)} of the runs of {', '.join(dict.fromkeys(of))}"
+    return f"{text}."
 
 
 def _row(env: str, method: str, seeds: dict[int, Curve], tables: Tables) -> dict[str, str]:

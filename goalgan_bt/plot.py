@@ -27,7 +27,7 @@ class PlotConfig:
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """Run folders."""
     out: Path | None = None
-    """PNG to write; by default coverage.png in the first run folder."""
+    """PNG to write; by default curves.png in the first run folder."""
     maps: int = 4
     """Coverage maps per run, spread over training."""
     at: tuple[int, ...] = ()
@@ -48,7 +48,7 @@ def main() -> int:
             from goalgan_bt.viz import pictures
         except ImportError:
             raise RunError('plots need matplotlib: pip install "goalgan_bt[plots]"') from None
-        path = cfg.out or cfg.runs[0] / "coverage.png"
+        path = cfg.out or cfg.runs[0] / "curves.png"
         pictures.overview(list(cfg.runs), cfg.maps, cfg.at).savefig(path, dpi=150)
     except (RunError, OSError, ValueError) as error:
         complain(str(error))

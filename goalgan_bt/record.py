@@ -64,15 +64,28 @@ def new_run(
     return folder
 
 
+def code_commit(file: Path) -> str | None:
+    """The git commit of the checkout that a file of code is part of, with "-dirty" behind it if
+    code was changed since (tables and texts, which studies write, do not count); None if it is
+    part of none, such as an installed package, or there is no git."""
+
+    def git(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            ["git", *words], cwd=file.parent, capture_output=True, text=True, check=False
+        )
+
+    try:
+        if git("ls-files", "--error-unmatch", file.name).returncode != 0:
+            return None
+        commit = git("rev-parse", "HEAD").stdout.strip()
+        changed = git("diff", "--quiet", "HEAD", "--", ":/*.py", ":/*.toml").returncode != 0
+    except OSError:
+        return None
+    return f"{commit}-dirty" if changed else commit
+
+
 def write_meta(folder: Path, maze: Maze | None) -> None:
     """Write what is needed to know and to draw this run to `meta.json`."""
-    commit = subprocess.run(
-        ["git", "describe", "--always", "--dirty", "--abbrev=40"],
-        cwd=Path(__file__).parent,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
     versions = {}
     for package in PACKAGES:
         try:
@@ -81,7 +94,7 @@ def write_meta(folder: Path, maze: Maze | None) -> None:
             versions[package] = "not installed"
     meta = {
         "argv": sys.argv[1:],
-        "commit": commit.stdout.strip() or None,
+        "commit": code_commit(Path(__file__)),
         "python": platform.python_version(),
         "cores": len(os.sched_getaffinity(0)),
         "versions": versions,

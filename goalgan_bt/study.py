@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 
-if __name__ == "__main__":  # nothing is lost: what is finished is on disk, the rest goes on
+if __name__ == "__main__":  # while it imports, nothing has begun
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
 
 import csv
@@ -40,6 +40,7 @@ SHIPPED = Path(__file__).parent / "studies"
 KEY = ("env", "method", "seed")
 OURS = {"--env", "--seed", "--out", "--resume", "--viz", "--threads", "--help", "-h"}
 COSTS = (*KEY, "flags", "commit", "train", "label", "eval", "seconds")  # of costs.csv
+TRAININGS: list["subprocess.Popen[str]"] = []  # what this process runs at present
 
 
 class Study(NamedTuple):
@@ -200,16 +201,19 @@ def perform(run: Run, folder: Path) -> Path:
             raise record.RunError(f"{place} was begun with other settings: remove it")
         flags = ["--resume", str(place), "--viz", "none"]
     folder.mkdir(parents=True, exist_ok=True)
-    done = subprocess.run(
+    with subprocess.Popen(
         [sys.executable, "-m", "goalgan_bt.train", *flags],
         env=os.environ | {"OMP_NUM_THREADS": "1"},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
-    )
-    finished = begun and "has reached its limits" in done.stderr  # killed just before it said so
-    if done.returncode != 0 and not finished:
-        last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
+    ) as training:
+        TRAININGS.append(training)
+        _, errors = training.communicate()
+    TRAININGS.remove(training)
+    finished = begun and "has reached its limits" in errors  # killed just before it said so
+    if training.returncode != 0 and not finished:
+        last = (errors.strip().splitlines() or ["it said nothing"])[-1]
         raise record.RunError(f"{run.env}, {run.method}, seed {run.seed} failed: {last}")
     return max(folder.glob("*/config.json"), key=os.path.getmtime).parent
 
@@ -343,6 +347,14 @@ def finished(
         yield jobs[job], job
 
 
+def _leave(number: int, _: object) -> None:
+    """Nothing is lost: what is finished is on disk, the rest leaves a checkpoint where it can."""
+    for training in TRAININGS:
+        training.terminate()
+    os.write(2, b"error: interrupted: the same command goes on with what is missing\n")
+    os._exit(130 if number == signal.SIGINT else 2)
+
+
 def main() -> int:
     """The command line; returns the exit code."""
     try:
@@ -361,6 +373,8 @@ def main() -> int:
         failed = 0
         if missing and not cfg.report:
             say(f"{study.name}: {len(missing)} runs of {len(grid(study))} to go")
+            signal.signal(signal.SIGINT, _leave)
+            signal.signal(signal.SIGTERM, _leave)
             began = time.monotonic()
             places = cfg.runs / study.name
             for i, (run, job) in enumerate(finished(cfg, missing, places), 1):

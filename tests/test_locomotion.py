@@ -39,7 +39,7 @@ def test_a_run_of_the_hopper(method, steps, tmp_path):
     assert ("mean" in saved) == (method == "trpo")
     assert any(name.startswith(("actor", "action_net")) for name in weights)
     drawn = run_module("plot", folder)
-    assert drawn.returncode == 0 and (folder / "coverage.png").stat().st_size > 10_000
+    assert drawn.returncode == 0 and (folder / "curves.png").stat().st_size > 10_000
     watched = run_module("viz", folder)
     assert watched.returncode == 2 and "hopper has no map" in watched.stderr
 

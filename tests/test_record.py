@@ -1,4 +1,6 @@
 import csv
+import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -43,6 +45,34 @@ def test_a_resumed_record_drops_what_came_after_its_checkpoint(tmp_path):
     resumed.metrics(row(4, new=1.0))
     assert [r["iteration"] for r in cells(tmp_path)] == ["1", "2", "3", "4"]
     assert [f.stem for f in record.frames(tmp_path)] == ["000001", "000002", "000003"]
+
+
+def test_the_commit_is_that_of_the_code(tmp_path):
+    """Changed code shows, changed tables do not; a file in no commit has none."""
+
+    def git(*words):
+        given = ["git", "-c", "user.name=x", "-c", "user.email=x", *words]
+        return subprocess.run(given, cwd=tmp_path, check=True, capture_output=True, text=True)
+
+    code, table = tmp_path / "code.py", tmp_path / "table.csv"
+    code.write_text("a = 1")
+    git("init")
+    assert record.code_commit(code) is None
+    table.write_text("a")
+    git("add", ".")
+    git("commit", "-m", "first")
+    commit = git("rev-parse", "HEAD").stdout.strip()
+    table.write_text("b")
+    assert record.code_commit(code) == commit
+    code.write_text("a = 2")
+    assert record.code_commit(code) == f"{commit}-dirty"
+    (tmp_path / "new.py").write_text("")
+    assert record.code_commit(tmp_path / "new.py") is None
+
+
+def test_without_git_there_is_no_commit(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert record.code_commit(Path(record.__file__)) is None
 
 
 def test_a_last_row_cut_short_is_left_out(tmp_path):

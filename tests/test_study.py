@@ -2,6 +2,10 @@
 
 import csv
 import shutil
+import signal
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -203,6 +207,31 @@ def test_a_run_that_was_cut_off_goes_on(finished, tmp_path):
     assert study.perform(longer, place) == folder
     assert (folder / "metrics.csv").read_text().splitlines()[-1].startswith("4,")
     assert (folder / "ended.txt").read_text().startswith("complete")
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 2)])
+def test_an_interrupted_study_ends_its_trainings(tmp_path, number, code):
+    """Each leaves a checkpoint, from which the same command goes on."""
+    (tmp_path / "tiny.toml").write_text(TINY.replace("--iterations 3", "--iterations 4000"))
+    words = ["tiny.toml", "--out", "out", "--runs", "runs", "--processes", "2"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "goalgan_bt.study", *words],
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 90
+    while len(begun := list(tmp_path.glob("runs/**/metrics.csv"))) < 2:
+        assert time.monotonic() < deadline and process.poll() is None
+        time.sleep(0.1)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == code
+    assert errors == "error: interrupted: the same command goes on with what is missing\n"
+    while not all((metrics.parent / "ended.txt").exists() for metrics in begun):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    assert all((metrics.parent / "checkpoint.pt").exists() for metrics in begun)
 
 
 def test_a_run_that_fails_says_why(tmp_path):
