@@ -180,6 +180,15 @@ def test_learning_goes_on_where_it_was_or_anew():
     assert len(callback.trajectories) == before + 2
 
 
+def test_the_bound_fades_and_then_nothing_is_recalled(monkeypatch):
+    callback, turns = recall(every=100, fade_steps=1000, max_kl=0.01), []
+    turn = callback.turn
+    monkeypatch.setattr(callback, "turn", lambda: turns.append(callback.bound()) or turn())
+    agent("PPO", make_vec_env(Reach, n_envs=2, seed=0)).learn(3000, callback=callback)
+    assert turns == pytest.approx([0.01 * (1 - 512 / 1000)])  # rollouts of 512: the first is none
+    assert callback.last == {} and callback.bound() == 0
+
+
 @pytest.mark.parametrize("name", ["SAC", "PPO"])
 def test_every_call_of_learn_has_its_turns(name, monkeypatch):
     callback, turns = recall(every=100), []
@@ -297,6 +306,7 @@ def test_traces_begin_where_it_pays_to_be(monkeypatch):
         {"model": "forwards"},
         {"seeds": "values"},
         {"trace_length": 2.5},
+        {"fade_steps": 0},
     ],
 )
 def test_settings_that_make_no_sense_are_refused(bad):
