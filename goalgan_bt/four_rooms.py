@@ -10,6 +10,7 @@ backward action model q(a_t | s_{t+1}) learned from the best trajectories, or un
 import re
 import sys
 import time
+from collections import deque
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -28,6 +29,7 @@ NAME = re.compile(r"four_rooms_(\d{1,2})")
 FAINT = 0.01  # times that each possible action counts as seen, so that none is impossible
 FLOOR = 1e-4  # of a priority, so that nothing is never replayed
 BETWEEN = 1.05  # factor of the steps between two reports: early on much changes in a few
+RECENT = 100  # episodes of training by whose success the imitation fades
 EPISODES = 50  # with which a policy is measured
 
 
@@ -54,8 +56,8 @@ class ReplayConfig:
 class TracesConfig:
     """Recall traces and their imitation."""
 
-    length: int = 20
-    """Steps of a recall trace."""
+    length: int = 60
+    """Steps of a recall trace: more than from the start to the goal."""
     number: int = 16
     """Recall traces per update."""
     every: int = 1
@@ -66,6 +68,9 @@ class TracesConfig:
     """Best trajectories from which the backward action model learns (the paper's k_traj)."""
     rate: float = 0.1
     """Step size of the imitation."""
+    fade: bool = True
+    """Whether that shrinks with the share of the last episodes that reached the goal: what helps a
+    novice holds back an expert."""
 
 
 @dataclass(frozen=True)
@@ -196,15 +201,21 @@ class Recall:
     def __init__(self, rooms: FourRooms, cfg: TracesConfig, learned: bool) -> None:
         self._rooms, self.cfg, self._learned = rooms, cfg, learned
         self.best: list[Trajectory] = []  # the shortest first, which have the highest return
+        self._won: deque[bool] = deque(maxlen=RECENT)
         self._model: FloatArray | None = None  # q(a | s') as long as they stay the same
 
     def add(self, trajectory: Trajectory) -> None:
-        """Keep an episode that reached the goal, if it is among the best."""
+        """Keep a finished episode, if it reached the goal and is among the best."""
+        self._won.append(trajectory.success)
         if trajectory.success:
             self.best.append(trajectory)
             self.best.sort(key=lambda known: len(known.actions))
             del self.best[self.cfg.trajectories :]
             self._model = None
+
+    def rate(self) -> float:
+        """Step size of the imitation at present."""
+        return self.cfg.rate * (1 - float(np.mean(self._won)) if self.cfg.fade else 1.0)
 
     def action_model(self) -> FloatArray:
         """q(a | s'), (S, A): how often each action led to s' in the best trajectories, which is
@@ -234,10 +245,10 @@ class Recall:
 
     def teach(self, learner: ActorCritic, rng: np.random.Generator) -> None:
         """Let the policy imitate recall traces, once there is a trajectory to learn from."""
-        for _ in range(self.cfg.updates if self.best else 0):
+        for _ in range(self.cfg.updates if self.best and self.rate() > 0 else 0):
             states, actions = self.traces(rng)
             ones = np.ones(states.size)
-            learner.reinforce(states.ravel(), actions.ravel(), ones, self.cfg.rate)
+            learner.reinforce(states.ravel(), actions.ravel(), ones, self.rate())
 
 
 class Batch(NamedTuple):

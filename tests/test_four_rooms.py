@@ -139,6 +139,28 @@ def test_traces_begin_at_the_goal_and_obey_the_world():
     np.testing.assert_array_equal(rooms.next_state[states, actions], following)
 
 
+def test_imitation_fades_with_success():
+    """In proportion, to nothing at all; unless it is told not to."""
+    rooms, rng = FourRooms(7), np.random.default_rng(4)
+    recall, constant = (Recall(rooms, TracesConfig(fade=fade), True) for fade in (True, False))
+    path = walk_to_goal(rooms, rng)
+    moved = []
+    for won in (1, 49, 50):
+        for each in (recall, constant):
+            for i in range(100):
+                each.add(path._replace(success=i < won))
+        learner, steady = (ActorCritic(*rooms.next_state.shape) for _ in range(2))
+        recall.teach(learner, np.random.default_rng(0))
+        constant.teach(steady, np.random.default_rng(0))
+        moved.append(np.abs(learner.logits).sum() / np.abs(steady.logits).sum())
+        assert recall.rate() == pytest.approx(constant.rate() * (1 - won / 100))
+    assert moved == pytest.approx([0.99, 0.51, 0.5])
+    for _ in range(100):
+        recall.add(path)
+    recall.teach(learner := ActorCritic(*rooms.next_state.shape), rng)
+    assert (learner.logits == 0).all()
+
+
 def test_replay_prefers_what_turned_out_better_than_thought():
     cfg = four_rooms.ReplayConfig(batch=4000, alpha=1.0, beta=0.0, rate=0.0, capacity=8)
     replay, learner = Prioritised(cfg), ActorCritic(4, 4)
