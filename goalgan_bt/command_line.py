@@ -67,9 +67,17 @@ def fault(cfg: Any, names: str, good: Callable[[Any], bool], what: str) -> str |
     return None
 
 
-def exit_code(work: Callable[[], None]) -> int:
+def exit_code(
+    work: Callable[[], None],
+    interrupted: str = "what was measured is in the run folder; start again",
+) -> int:
     """Do some work; whatever its user can mend is told in one line, with exit code 2, or 130 for
-    Ctrl-C."""
+    Ctrl-C.
+
+    Args:
+        work: what to do.
+        interrupted: what to say of it where it is interrupted.
+    """
     asked = signal.SIGINT
 
     def stop(number: int, _: object) -> None:
@@ -82,7 +90,7 @@ def exit_code(work: Callable[[], None]) -> int:
     try:
         work()
     except KeyboardInterrupt:
-        complain("interrupted: what was measured is in the run folder; start again")
+        complain(f"interrupted: {interrupted}")
         return 130 if asked == signal.SIGINT else 2
     except MemoryError:
         complain("out of memory: use smaller settings")

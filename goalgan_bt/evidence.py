@@ -198,7 +198,7 @@ def _commits(costs: list[dict[str, str]]) -> str:
     methods: dict[str, list[str]] = {}
     for row in costs:
         commit, dirty = row["commit"][:12], "-dirty" * row["commit"].endswith("-dirty")
-        methods.setdefault(commit + dirty, []).append(row["method"])
+        methods.setdefault(commit + dirty or "unknown", []).append(row["method"])
     most, *others = sorted(methods, key=lambda commit: -len(methods[commit]))
     text = f"Commit: {most}"
     for commit in others:

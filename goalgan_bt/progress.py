@@ -1,5 +1,6 @@
 """What a person sees while it trains: one live table, or one plain line per report."""
 
+import contextlib
 import sys
 import time
 from types import TracebackType
@@ -87,8 +88,9 @@ def say(text: str) -> None:
 
 
 def complain(text: str) -> None:
-    """One line on standard error."""
-    print(f"error: {text}", file=sys.stderr, flush=True)
+    """One line on standard error, if anybody listens there."""
+    with contextlib.suppress(OSError):
+        print(f"error: {text}", file=sys.stderr, flush=True)
 
 
 def _duration(seconds: float) -> str:

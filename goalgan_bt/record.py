@@ -64,24 +64,27 @@ def new_run(
     return folder
 
 
-def code_commit(file: Path) -> str | None:
-    """The git commit of the checkout that a file of code is part of, with "-dirty" behind it if
-    code was changed since (tables and texts, which studies write, do not count); None if it is
-    part of none, such as an installed package, or there is no git."""
+def code_commit(folder: Path) -> str | None:
+    """The git commit of the checkout that a folder of code is part of.
 
-    def git(*words: str) -> subprocess.CompletedProcess[str]:
+    With "-dirty" behind it if the code was changed since: that folder, or what belongs to it
+    outside (tables and texts, which studies write, do not count). None if it is part of no
+    checkout, such as an installed package, or there is no git.
+    """
+
+    def git(*words: str) -> str:
+        asked = ["git", *words]
         return subprocess.run(
-            ["git", *words], cwd=file.parent, capture_output=True, text=True, check=False
-        )
+            asked, cwd=folder, capture_output=True, text=True, check=True
+        ).stdout.strip()
 
     try:
-        if git("ls-files", "--error-unmatch", file.name).returncode != 0:
+        if not git("ls-files", "."):
             return None
-        commit = git("rev-parse", "HEAD").stdout.strip()
-        changed = git("diff", "--quiet", "HEAD", "--", ":/*.py", ":/*.toml").returncode != 0
-    except OSError:
+        changed = git("status", "--porcelain", "--", ".", ":/envs", ":/viz", ":/pyproject.toml")
+        return git("rev-parse", "--verify", "HEAD") + "-dirty" * bool(changed)
+    except (OSError, subprocess.CalledProcessError):
         return None
-    return f"{commit}-dirty" if changed else commit
 
 
 def write_meta(folder: Path, maze: Maze | None) -> None:
@@ -94,7 +97,7 @@ def write_meta(folder: Path, maze: Maze | None) -> None:
             versions[package] = "not installed"
     meta = {
         "argv": sys.argv[1:],
-        "commit": code_commit(Path(__file__)),
+        "commit": code_commit(Path(__file__).parent),
         "python": platform.python_version(),
         "cores": len(os.sched_getaffinity(0)),
         "versions": versions,

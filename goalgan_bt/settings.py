@@ -237,7 +237,9 @@ class RecallConfig:
     """Imitation stops where the mean KL of a turn passes this, nats."""
     fade_steps: int | None = None
     """If given, that bound falls on a line to zero at this many environment steps, after which
-    nothing is recalled: what helps a novice holds back an expert."""
+    nothing is recalled: what helps a novice holds back an expert. The imitation is the same until
+    the bound comes down to it. Steps are the agent's `num_timesteps`: a `learn` that resets them
+    begins anew."""
 
     def problem(self) -> str | None:
         """What is wrong with these settings, if anything is."""
@@ -247,8 +249,9 @@ class RecallConfig:
                 return f"{name} must be greater than 0, not {getattr(self, name)}"
             if name in counts.split() and not isinstance(getattr(self, name), int):
                 return f"{name} must be a whole number, not {getattr(self, name)}"
-        if self.fade_steps is not None and not self.fade_steps > 0:
-            return f"fade_steps must be greater than 0, or None, not {self.fade_steps}"
+        fade = self.fade_steps
+        if fade is not None and (type(fade) is not int or fade < 1):
+            return f"fade_steps must be a whole number from 1 on, or None, not {fade!r}"
         for name, choices in (("model", "backward forward"), ("seeds", "value reward")):
             if getattr(self, name) not in choices.split():
                 return f"{name} must be one of {choices}, not {getattr(self, name)!r}"

@@ -33,7 +33,7 @@ from typing import Any, Literal, NamedTuple
 import tyro
 
 from goalgan_bt import config, locomotion, record
-from goalgan_bt.command_line import UsageError, parse
+from goalgan_bt.command_line import UsageError, exit_code, parse
 from goalgan_bt.progress import complain, say
 
 SHIPPED = Path(__file__).parent / "studies"
@@ -330,7 +330,10 @@ def finished(
             for job in as_completed(jobs):
                 yield jobs[job], job
         finally:
-            pool.shutdown(cancel_futures=True)
+            pool.shutdown(wait=False, cancel_futures=True)
+            for training in list(TRAININGS):  # where this was interrupted: each saves what it can
+                training.terminate()
+            pool.shutdown()
         return
     try:
         import submitit
@@ -347,59 +350,52 @@ def finished(
         yield jobs[job], job
 
 
-def _leave(number: int, _: object) -> None:
-    """Nothing is lost: what is finished is on disk, the rest leaves a checkpoint where it can."""
-    for training in TRAININGS:
-        training.terminate()
-    os.write(2, b"error: interrupted: the same command goes on with what is missing\n")
-    os._exit(130 if number == signal.SIGINT else 2)
+def work() -> None:
+    """What the command line asks for.
+
+    Raises:
+        UsageError, RunError: saying what is wrong with it, or what is left to do.
+    """
+    cfg = parse(StudyConfig, None, "python -m goalgan_bt.study")
+    if cfg.processes < 0:
+        raise UsageError(f"--processes must be 0 or more, not {cfg.processes}")
+    try:
+        from goalgan_bt import evidence
+    except ImportError:
+        raise UsageError(
+            'the report needs matplotlib and scipy: pip install "goalgan_bt[study]"'
+        ) from None
+    study = load(cfg.study)
+    tables = Tables(cfg.out / study.name, study.measure)
+    missing = [run for run in grid(study) if not tables.has(run)]
+    failed = 0
+    if missing and not cfg.report:
+        say(f"{study.name}: {len(missing)} runs of {len(grid(study))} to go")
+        began = time.monotonic()
+        places = cfg.runs / study.name
+        for i, (run, job) in enumerate(finished(cfg, missing, places), 1):
+            try:
+                last = tables.add(run, job.result())
+            except Exception as error:  # whatever became of one run, the others go on
+                failed += 1
+                complain((str(error).strip().splitlines() or [type(error).__name__])[-1])
+                continue
+            left = (time.monotonic() - began) / i * (len(missing) - i) / 60
+            say(
+                f"{time.strftime('%H:%M:%S')} {i}/{len(missing)} {run.env} {run.method} "
+                f"s{run.seed}: {study.measure} {last:.3f}  left {left:.0f} min"
+            )
+    if not tables.costs:
+        raise UsageError(f"{tables.folder} holds no finished run yet: run the study first")
+    evidence.report(study, tables)
+    say(str(tables.folder / "README.md"))
+    if failed:
+        raise record.RunError(f"{failed} runs failed: the same command tries them again")
 
 
 def main() -> int:
     """The command line; returns the exit code."""
-    try:
-        cfg = parse(StudyConfig, None, "python -m goalgan_bt.study")
-        if cfg.processes < 0:
-            raise UsageError(f"--processes must be 0 or more, not {cfg.processes}")
-        try:
-            from goalgan_bt import evidence
-        except ImportError:
-            raise UsageError(
-                'the report needs matplotlib and scipy: pip install "goalgan_bt[study]"'
-            ) from None
-        study = load(cfg.study)
-        tables = Tables(cfg.out / study.name, study.measure)
-        missing = [run for run in grid(study) if not tables.has(run)]
-        failed = 0
-        if missing and not cfg.report:
-            say(f"{study.name}: {len(missing)} runs of {len(grid(study))} to go")
-            signal.signal(signal.SIGINT, _leave)
-            signal.signal(signal.SIGTERM, _leave)
-            began = time.monotonic()
-            places = cfg.runs / study.name
-            for i, (run, job) in enumerate(finished(cfg, missing, places), 1):
-                try:
-                    last = tables.add(run, job.result())
-                except Exception as error:  # whatever became of one run, the others go on
-                    failed += 1
-                    complain((str(error).strip().splitlines() or [type(error).__name__])[-1])
-                    continue
-                left = (time.monotonic() - began) / i * (len(missing) - i) / 60
-                say(
-                    f"{time.strftime('%H:%M:%S')} {i}/{len(missing)} {run.env} {run.method} "
-                    f"s{run.seed}: {study.measure} {last:.3f}  left {left:.0f} min"
-                )
-        if not tables.costs:
-            raise UsageError(f"{tables.folder} holds no finished run yet: run the study first")
-        evidence.report(study, tables)
-        say(str(tables.folder / "README.md"))
-        if failed:
-            complain(f"{failed} runs failed: the same command tries them again")
-            return 2
-    except (UsageError, record.RunError, OSError) as error:
-        complain(str(error))
-        return 2
-    return 0
+    return exit_code(work, "the same command goes on with what is missing")
 
 
 if __name__ == "__main__":

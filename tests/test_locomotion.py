@@ -16,6 +16,8 @@ def test_presets_are_the_papers():
     assert locomotion.preset("hopper", "trpo").backtracking.trace_length == 10
     assert locomotion.preset("hopper", "sac").backtracking.trace_length == 20
     assert locomotion.preset("humanoid", "sac").backtracking.trace_length == 50
+    for cfg in (locomotion.preset("ant", method) for method in ("trpo", "sac")):
+        assert cfg.backtracking.fade_steps == cfg.total_steps // 2  # this is ours
     asked = locomotion.from_command_line(["--env", "ant", "--method", "sac"])
     assert (asked.num_envs, asked.total_steps, asked.backtracking.trace_length) == (1, 200_000, 50)
     with pytest.raises(UsageError, match="trpo or sac"):

@@ -48,31 +48,38 @@ def test_a_resumed_record_drops_what_came_after_its_checkpoint(tmp_path):
 
 
 def test_the_commit_is_that_of_the_code(tmp_path):
-    """Changed code shows, changed tables do not; a file in no commit has none."""
+    """Changed code shows, changed tables do not; a repository that it is no part of does not."""
 
     def git(*words):
         given = ["git", "-c", "user.name=x", "-c", "user.email=x", *words]
         return subprocess.run(given, cwd=tmp_path, check=True, capture_output=True, text=True)
 
-    code, table = tmp_path / "code.py", tmp_path / "table.csv"
-    code.write_text("a = 1")
+    package, other = tmp_path / "package", tmp_path / "other"
+    for place in (package, other, tmp_path / "viz"):
+        place.mkdir()
+        (place / "code.py").write_text("a = 1")
+    table = tmp_path / "table.csv"
+    assert record.code_commit(package) is None
     git("init")
-    assert record.code_commit(code) is None
-    table.write_text("a")
-    git("add", ".")
+    git("add", "package", "viz")
+    assert record.code_commit(package) is None  # there is no commit yet
     git("commit", "-m", "first")
     commit = git("rev-parse", "HEAD").stdout.strip()
-    table.write_text("b")
-    assert record.code_commit(code) == commit
-    code.write_text("a = 2")
-    assert record.code_commit(code) == f"{commit}-dirty"
-    (tmp_path / "new.py").write_text("")
-    assert record.code_commit(tmp_path / "new.py") is None
+    table.write_text("a")
+    assert record.code_commit(package) == commit
+    assert record.code_commit(other) is None  # an installed package, say
+    for changed in (package / "code.py", package / "new.py", tmp_path / "viz/code.py"):
+        changed.write_text("a = 2")
+        assert record.code_commit(package) == f"{commit}-dirty"
+        git("add", ".")
+        git("commit", "-m", "next")
+        commit = git("rev-parse", "HEAD").stdout.strip()
+        assert record.code_commit(package) == commit
 
 
 def test_without_git_there_is_no_commit(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert record.code_commit(Path(record.__file__)) is None
+    assert record.code_commit(Path(record.__file__).parent) is None
 
 
 def test_a_last_row_cut_short_is_left_out(tmp_path):

@@ -180,12 +180,21 @@ def test_learning_goes_on_where_it_was_or_anew():
     assert len(callback.trajectories) == before + 2
 
 
-def test_the_bound_fades_and_then_nothing_is_recalled(monkeypatch):
-    callback, turns = recall(every=100, fade_steps=1000, max_kl=0.01), []
-    turn = callback.turn
-    monkeypatch.setattr(callback, "turn", lambda: turns.append(callback.bound()) or turn())
-    agent("PPO", make_vec_env(Reach, n_envs=2, seed=0)).learn(3000, callback=callback)
-    assert turns == pytest.approx([0.01 * (1 - 512 / 1000)])  # rollouts of 512: the first is none
+def test_the_bound_fades_and_then_nothing_is_recalled():
+    """On a line; imitation obeys it; of what is over nothing is said any more."""
+    callback = recall(every=100, fade_steps=6000, max_kl=0.01)
+    model = agent("PPO", make_vec_env(Reach, n_envs=2, seed=0))
+    model.learn(4608, callback=callback)  # nine rollouts of 512 steps
+    assert callback.last["kl"] > 0
+    assert callback.bound() == pytest.approx(0.01 * (1 - 4608 / 6000))
+    strong = {"imitation_steps": 200, "learning_rate": 1e-3, "max_kl": 0.01}
+    callback.cfg = RecallConfig(fade_steps=6000, **strong)
+    states = np.random.default_rng(0).uniform(-1, 1, (200, 2))
+    callback.num_timesteps = 5990
+    assert callback._imitate(states, np.ones((200, 2)), states)["kl"] <= 0.01 * 10 / 6000
+    callback.num_timesteps = 3000
+    assert callback._imitate(states, np.ones((200, 2)), states)["kl"] > 0.001
+    model.learn(3000, callback=callback, reset_num_timesteps=False)
     assert callback.last == {} and callback.bound() == 0
 
 
@@ -307,6 +316,7 @@ def test_traces_begin_where_it_pays_to_be(monkeypatch):
         {"seeds": "values"},
         {"trace_length": 2.5},
         {"fade_steps": 0},
+        {"fade_steps": 2.5},
     ],
 )
 def test_settings_that_make_no_sense_are_refused(bad):

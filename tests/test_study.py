@@ -1,6 +1,8 @@
 """Studies: the statistics by hand, and one small study from its file to its report."""
 
+import contextlib
 import csv
+import os
 import shutil
 import signal
 import subprocess
@@ -185,10 +187,13 @@ def test_differences_are_paired_by_seed():
     steps = np.array([1e6, 2e6])
     of = {
         name: {seed: Curve(steps, np.array([0.0, more + 100 * seed])) for seed in range(3)}
-        for name, more in (("recall_traces", 10.0), ("trpo", 0.0))
+        for name, more in (("recall_traces", 10.0), ("trpo", 0.0), ("forward_model", 4.0))
     }
-    *_, line = evidence._differences(of)[:5]
-    assert line == "| recall_traces less trpo | 3 | 5.00 [5.00, 5.00] | 10 [10, 10] |"
+    assert evidence._differences(of)[4:] == [
+        "| recall_traces less trpo | 3 | 5.00 [5.00, 5.00] | 10 [10, 10] |",
+        "| forward_model less trpo | 3 | 2.00 [2.00, 2.00] | 4.00 [4.00, 4.00] |",
+        "| recall_traces less forward_model | 3 | 3.00 [3.00, 3.00] | 6.00 [6.00, 6.00] |",
+    ]
     assert evidence.area(Curve(steps[:1], np.array([7.0]))) == 7.0
 
 
@@ -211,27 +216,52 @@ def test_a_run_that_was_cut_off_goes_on(finished, tmp_path):
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 2)])
 def test_an_interrupted_study_ends_its_trainings(tmp_path, number, code):
-    """Each leaves a checkpoint, from which the same command goes on."""
-    (tmp_path / "tiny.toml").write_text(TINY.replace("--iterations 3", "--iterations 4000"))
+    """They have left their checkpoints when it ends, so that the same command goes on."""
+    (tmp_path / "tiny.toml").write_text(TINY.replace("--iterations 3", "--iterations 20"))
     words = ["tiny.toml", "--out", "out", "--runs", "runs", "--processes", "2"]
     process = subprocess.Popen(
         [sys.executable, "-m", "goalgan_bt.study", *words],
         cwd=tmp_path,
         stderr=subprocess.PIPE,
         text=True,
+        start_new_session=True,
     )
-    deadline = time.monotonic() + 90
-    while len(begun := list(tmp_path.glob("runs/**/metrics.csv"))) < 2:
-        assert time.monotonic() < deadline and process.poll() is None
-        time.sleep(0.1)
-    process.send_signal(number)
-    _, errors = process.communicate(timeout=30)
+    try:
+        deadline = time.monotonic() + 90
+        while len(begun := list(tmp_path.glob("runs/**/metrics.csv"))) < 2:
+            assert time.monotonic() < deadline and process.poll() is None
+            time.sleep(0.1)
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=60)
+        with pytest.raises(ProcessLookupError):
+            os.killpg(process.pid, 0)  # nobody is left
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
     assert process.returncode == code
     assert errors == "error: interrupted: the same command goes on with what is missing\n"
-    while not all((metrics.parent / "ended.txt").exists() for metrics in begun):
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
-    assert all((metrics.parent / "checkpoint.pt").exists() for metrics in begun)
+    for metrics in begun:
+        assert (metrics.parent / "checkpoint.pt").exists()
+    again = subprocess.run(
+        [sys.executable, "-m", "goalgan_bt.study", *words], cwd=tmp_path, timeout=300, check=False
+    )
+    assert again.returncode == 0
+    assert len(list(tmp_path.glob("runs/**/metrics.csv"))) == 4  # no run was begun twice
+    for metrics in begun:
+        assert metrics.read_text().splitlines()[-1].startswith("20,")
+
+
+def test_a_report_names_its_commits():
+    def row(commit, method):
+        return {"commit": commit, "method": method}
+
+    ours, other = 40 * "a", 40 * "b"
+    assert evidence._commits([row(ours, "x")]) == f"Commit: {ours[:12]}."
+    several = [row(f"{other}-dirty", "y"), row(ours, "x"), row(ours, "y"), row("", "z")]
+    assert evidence._commits(several) == (
+        f"Commit: {ours[:12]}; {other[:12]}-dirty for 1 of the runs of y; "
+        "unknown for 1 of the runs of z."
+    )
 
 
 def test_a_run_that_fails_says_why(tmp_path):
