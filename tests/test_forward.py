@@ -1,6 +1,7 @@
 """The forward model on a system that is known, and what it imagines."""
 
 import numpy as np
+import pytest
 import torch
 
 from goalgan_bt import config, envs
@@ -10,8 +11,11 @@ from goalgan_bt.learner import Learner
 from goalgan_bt.settings import BacktrackingConfig
 
 
-def test_it_recovers_a_linear_system():
-    rng = np.random.default_rng(0)
+@pytest.mark.parametrize("seed", range(3))
+def test_it_recovers_a_linear_system(seed):
+    """Its mean everywhere (at one point the fit of a small network wanders), and its noise."""
+    torch.manual_seed(seed)
+    rng = np.random.default_rng(seed)
     states = rng.normal(size=(5000, 3)).astype(np.float32)
     actions = rng.uniform(-1, 1, (5000, 3)).astype(np.float32)
     following = states + 0.5 * actions + rng.normal(0, 0.1, states.shape).astype(np.float32)
@@ -21,9 +25,9 @@ def test_it_recovers_a_linear_system():
     assert model.fit(data) == {}
     data.add(states, actions, following, np.zeros((5000, 2)), np.zeros(5000))
     assert set(model.fit(data)) == {"forward_nll"}
-    a = torch.full((3000, 3), 0.8)
-    error = model.successors(torch.zeros(3000, 3), a) - 0.4
-    assert error.mean(dim=0).abs().max() < 0.06
+    s, a = torch.randn(3000, 3), 2 * torch.rand(3000, 3) - 1
+    error = model.successors(s, a) - (s + 0.5 * a)
+    assert error.mean(dim=0).abs().max() < 0.03
     assert ((error.std(dim=0) - 0.1).abs() < 0.04).all()
 
 
