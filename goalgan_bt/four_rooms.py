@@ -246,10 +246,11 @@ class Recall:
 
     def teach(self, learner: ActorCritic, rng: np.random.Generator) -> None:
         """Let the policy imitate recall traces, once there is a trajectory to learn from."""
-        for _ in range(self.cfg.updates if self.best and self.rate() > 0 else 0):
+        rate = self.rate()
+        for _ in range(self.cfg.updates if self.best and rate > 0 else 0):
             states, actions = self.traces(rng)
             ones = np.ones(states.size)
-            learner.reinforce(states.ravel(), actions.ravel(), ones, self.rate())
+            learner.reinforce(states.ravel(), actions.ravel(), ones, rate)
 
 
 class Batch(NamedTuple):

@@ -15,6 +15,12 @@ from goalgan_bt.policy import GaussianPolicy, log_prob, mean_kl
 from goalgan_bt.settings import ImitationConfig
 
 
+def faded(max_kl: float, at: float, end: float | None) -> float:
+    """A bound on the KL that falls on a line to zero at `end`, from there on nothing is imitated;
+    without an end it stays."""
+    return max_kl if end is None else max_kl * (1 - min(1.0, at / end))
+
+
 class Imitation:
     """Gradient steps of a policy towards actions that were recalled."""
 
@@ -26,8 +32,7 @@ class Imitation:
 
     def max_kl(self, progress: float) -> float:
         """The bound on the KL at this progress in the run, 0 to 1."""
-        faded = 0.0 if self.cfg.fade is None else min(1.0, progress / self.cfg.fade)
-        return self.cfg.max_kl * (1 - faded)
+        return faded(self.cfg.max_kl, progress, self.cfg.fade)
 
     def update(
         self, obs: Tensor, actions: Tensor, reference: Tensor, progress: float

@@ -28,6 +28,7 @@ from goalgan_bt.backtracking import BacktrackingModel, Transitions, recall_trace
 from goalgan_bt.checkpoint import restore
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.forward import ForwardModel
+from goalgan_bt.imitation import faded
 from goalgan_bt.rollout import Float32
 from goalgan_bt.settings import BacktrackingConfig, RecallConfig
 
@@ -191,17 +192,15 @@ class RecallTraces(BaseCallback):
         if self.num_timesteps - self._turned >= self.cfg.every:
             self._turned = self.num_timesteps
             begin = time.perf_counter()
-            self.last = self.turn() if self.bound() > 0 else {}
+            self.last = self.turn() if self.max_kl() > 0 else {}
             for name, value in self.last.items():
                 self.logger.record(f"recall/{name}", value)
             self.seconds += time.perf_counter() - begin
             self.logger.record("recall/seconds", self.seconds)
 
-    def bound(self) -> float:
-        """On the KL of an imitation at present, nats."""
-        fade = self.cfg.fade_steps
-        faded = 0.0 if fade is None else min(1.0, self.num_timesteps / fade)
-        return self.cfg.max_kl * (1 - faded)
+    def max_kl(self) -> float:
+        """The bound on the KL at present, nats."""
+        return faded(self.cfg.max_kl, self.num_timesteps, self.cfg.fade_steps)
 
     def best(self) -> tuple[list[Trajectory], float]:
         """The trajectories whose return is in the top percent, and the lowest of those returns."""
@@ -365,7 +364,7 @@ class RecallTraces(BaseCallback):
         with torch.no_grad():
             old, before = self._gaussian(reference), self._gaussian(obs)
             log_pi = (before.log_prob(goals) + slope).sum(dim=1).mean().item()
-        bound = self.bound()
+        max_kl = self.max_kl()
         loss, kl, params = np.nan, 0.0, list(self._learner.parameters())
         for step in range(self.cfg.imitation_steps):
             some = torch.from_numpy(self._rng.integers(len(obs), size=self.cfg.imitation_batch))
@@ -382,7 +381,7 @@ class RecallTraces(BaseCallback):
                 new_kl = np.inf
                 if all(torch.isfinite(param).all() for param in params):
                     new_kl = kl_divergence(old, self._gaussian(reference)).sum(dim=1).mean().item()
-                if not new_kl <= bound:
+                if not new_kl <= max_kl:
                     for param, value in zip(params, known, strict=True):
                         param.copy_(value)
                     break

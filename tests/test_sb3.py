@@ -186,7 +186,7 @@ def test_the_bound_fades_and_then_nothing_is_recalled():
     model = agent("PPO", make_vec_env(Reach, n_envs=2, seed=0))
     model.learn(4608, callback=callback)  # nine rollouts of 512 steps
     assert callback.last["kl"] > 0
-    assert callback.bound() == pytest.approx(0.01 * (1 - 4608 / 6000))
+    assert callback.max_kl() == pytest.approx(0.01 * (1 - 4608 / 6000))
     strong = {"imitation_steps": 200, "learning_rate": 1e-3, "max_kl": 0.01}
     callback.cfg = RecallConfig(fade_steps=6000, **strong)
     states = np.random.default_rng(0).uniform(-1, 1, (200, 2))
@@ -195,7 +195,7 @@ def test_the_bound_fades_and_then_nothing_is_recalled():
     callback.num_timesteps = 3000
     assert callback._imitate(states, np.ones((200, 2)), states)["kl"] > 0.001
     model.learn(3000, callback=callback, reset_num_timesteps=False)
-    assert callback.last == {} and callback.bound() == 0
+    assert callback.last == {} and callback.max_kl() == 0
 
 
 @pytest.mark.parametrize("name", ["SAC", "PPO"])
