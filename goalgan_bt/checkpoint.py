@@ -14,9 +14,8 @@ if TYPE_CHECKING:
     from goalgan_bt.learner import Learner
 
 
-def save(learner: "Learner", folder: Path) -> None:
+def save(state: dict[str, Any], folder: Path) -> None:
     """Write `checkpoint.pt`; the old one stays in place until the new one is complete."""
-    state = learner.state_dict()
     write_atomically(folder / "checkpoint.pt", lambda file: torch.save(state, file))
 
 
@@ -26,7 +25,7 @@ def load(learner: "Learner", folder: Path) -> None:
     Raises:
         RunError: if there is none, or it is damaged or of other settings.
     """
-    with _saved(folder) as state:
+    with saved(folder) as state:
         learner.load_state_dict(state)
 
 
@@ -39,7 +38,7 @@ def load_policy(policy: GaussianPolicy, folder: Path) -> int:
     Raises:
         RunError: as `load`.
     """
-    with _saved(folder) as state:
+    with saved(folder) as state:
         policy.load_state_dict(state["modules"]["policy"])
         iteration = int(state["iteration"])
     return iteration
@@ -55,7 +54,7 @@ def restore(module: Any, state: dict[str, Any]) -> None:
 
 
 @contextmanager
-def _saved(folder: Path) -> Iterator[dict[str, Any]]:
+def saved(folder: Path) -> Iterator[dict[str, Any]]:
     """What `save` wrote; whatever goes wrong while it is read and taken over is a `RunError`."""
     path = folder / "checkpoint.pt"
     if not path.is_file():

@@ -69,14 +69,14 @@ def fault(cfg: Any, names: str, good: Callable[[Any], bool], what: str) -> str |
 
 def exit_code(
     work: Callable[[], None],
-    interrupted: str = "what was measured is in the run folder; start again",
+    interrupted: Callable[[], str] = lambda: "what was measured is in the run folder; start again",
 ) -> int:
     """Do some work; whatever its user can mend is told in one line, with exit code 2, or 130 for
     Ctrl-C.
 
     Args:
         work: what to do.
-        interrupted: what to say of it where it is interrupted.
+        interrupted: tells what to do where it is interrupted.
     """
     asked = signal.SIGINT
 
@@ -90,14 +90,14 @@ def exit_code(
     try:
         work()
     except KeyboardInterrupt:
-        complain(f"interrupted: {interrupted}")
+        complain(f"interrupted: {interrupted()}")
         return 130 if asked == signal.SIGINT else 2
     except MemoryError:
         complain("out of memory: use smaller settings")
         return 2
     except OSError as error:
         full = error.errno == errno.ENOSPC
-        complain("the disk is full: free some space" if full else str(error))
+        complain(f"the disk is full: free some space; {interrupted()}" if full else str(error))
         return 2
     except (UsageError, RunError) as error:
         complain(str(error))

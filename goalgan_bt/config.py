@@ -1,20 +1,17 @@
 """The settings of a run: those of each part, composed, and a preset per environment."""
 
-import json
 import math
 import os
 import sys
-import types
-import typing
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal
+from typing import Literal
 
 from goalgan_bt import envs, four_rooms, locomotion
 from goalgan_bt.command_line import UsageError, fault, parse, value_of
 from goalgan_bt.methods import METHODS
-from goalgan_bt.record import write_settings
+from goalgan_bt.record import env_of, read_settings, write_settings
 from goalgan_bt.settings import (
     BacktrackingConfig,
     CoverageConfig,
@@ -272,7 +269,8 @@ def from_command_line(argv: list[str] | None = None) -> Config:
 
     Raises:
         UsageError: for an unknown flag or a value of the wrong kind.
-        ConfigError: for a bad value or a folder that is no run.
+        ConfigError: for a bad value.
+        RunError: for a folder that is no run.
         SystemExit: after `--help`.
     """
     argv = sys.argv[1:] if argv is None else argv
@@ -302,37 +300,14 @@ def load(folder: Path) -> Config:
     """The settings of a run folder.
 
     Raises:
-        ConfigError: if the folder is no run or its settings cannot be read.
+        ConfigError: if its settings make no sense, or it is a run of another learner.
+        RunError: if the folder is no run or its settings cannot be read.
     """
+    if other_learner(["--env", env := env_of(folder)]):
+        raise ConfigError(f"{folder}: runs of {env} leave nothing to go on from: start again")
+    cfg = read_settings(Config, folder)
     try:
-        values = json.loads((folder / "config.json").read_text())
-        if isinstance(values, dict) and other_learner(["--env", str(env := values.get("env"))]):
-            raise ValueError(f"runs of {env} leave no checkpoint to go on from: start again")
-        cfg = _build(Config, values)
         check(cfg)
-        return cfg
-    except FileNotFoundError:
-        raise ConfigError(f"{folder} is no run: it has no config.json") from None
-    except (OSError, ValueError, TypeError) as error:
+    except (UsageError, TypeError) as error:
         raise ConfigError(f"cannot read {folder / 'config.json'}: {error}") from None
-
-
-def _build(kind: type[Any], values: dict[str, Any]) -> Any:
-    """A dataclass from what `asdict` and JSON made of it."""
-    if not isinstance(values, dict):
-        raise TypeError(f"expected settings, found {values!r}")
-    hints = typing.get_type_hints(kind)
-    known = {f.name for f in fields(kind)}
-    if unknown := set(values) - known:
-        raise ValueError(f"unknown settings {', '.join(sorted(unknown))}")
-    return kind(**{name: _convert(hints[name], value) for name, value in values.items()})
-
-
-def _convert(hint: Any, value: Any) -> Any:
-    if is_dataclass(hint):
-        return _build(typing.cast(type[Any], hint), value)
-    if value is not None and (
-        hint is Path or (isinstance(hint, types.UnionType) and Path in typing.get_args(hint))
-    ):
-        return Path(value)
-    return tuple(value) if isinstance(value, list) else value
+    return cfg

@@ -8,9 +8,11 @@ gymnasium's tasks and the agents of sb3-contrib and Stable-Baselines3, with the 
 
 import sys
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
+
+import numpy as np
 
 from goalgan_bt import record
 from goalgan_bt.command_line import UsageError, exit_code, fault, parse, value_of
@@ -32,6 +34,7 @@ REPORTS = 25  # per run
 BATCH = 4096  # steps of a TRPO update
 SEEDS = 1000  # environments of one run have seeds of their own, which no other run has
 # Without contact forces: zero nearly always, they are no part of what a model can unroll.
+REPLAY = "observations", "next_observations", "actions", "rewards", "dones", "timeouts"
 PLAIN: dict[str, dict[str, Any]] = {
     "ant": {"include_cfrc_ext_in_observation": False},
     "humanoid": {"include_cfrc_ext_in_observation": False},
@@ -52,6 +55,8 @@ class LocomotionConfig:
     """Environment steps of training."""
     out: Path = Path("runs")
     """Folder of runs; this run gets a folder of its own in it."""
+    resume: Path | None = None
+    """Go on with an unfinished run from its last measurement, with its settings."""
     num_envs: int = 4
     """Environments side by side (SAC: 1)."""
     hidden: int = 64
@@ -65,8 +70,10 @@ class LocomotionConfig:
 
 
 def asked_for(argv: list[str]) -> bool:
-    """Whether a command line names one of these environments."""
-    return value_of(argv, "--env") in TASKS
+    """Whether a command line names one of these environments, or a run in one."""
+    run = value_of(argv, "--resume")
+    env = value_of(argv, "--env") if run is None else record.env_of(Path(run))
+    return env in TASKS
 
 
 def preset(env: str, method: str) -> LocomotionConfig:
@@ -93,14 +100,45 @@ def preset(env: str, method: str) -> LocomotionConfig:
 
 
 def from_command_line(argv: list[str]) -> LocomotionConfig:
-    """The settings that a command line asks for.
+    """The settings that a command line asks for: with `--resume` the run's own.
 
     Raises:
         UsageError: for an unknown flag, a value of the wrong kind, or one that makes no sense.
+        RunError: if there is no such run, or its settings cannot be read.
         SystemExit: after `--help`.
     """
-    default = preset(value_of(argv, "--env") or "hopper", value_of(argv, "--method") or "trpo")
+    run = value_of(argv, "--resume")
+    if run is None:
+        env, method = value_of(argv, "--env"), value_of(argv, "--method")
+        default = preset(env or "hopper", method or "trpo")
+    else:
+        default = replace(load(Path(run)), resume=Path(run))
     cfg = parse(LocomotionConfig, argv, "python -m goalgan_bt.train", default)
+    if run is not None and cfg != default:
+        raise UsageError("a run of this kind goes on as it was begun: --resume takes no other flag")
+    check(cfg)
+    return cfg
+
+
+def load(folder: Path) -> LocomotionConfig:
+    """The settings of a run folder.
+
+    Raises:
+        UsageError: for bad ones.
+        RunError: if the folder is no run, or they cannot be read.
+    """
+    cfg = record.read_settings(LocomotionConfig, folder)
+    check(cfg)
+    return cfg
+
+
+def check(cfg: LocomotionConfig) -> None:
+    """Refuse settings that make no sense.
+
+    Raises:
+        UsageError: naming the first such setting.
+    """
+    preset(cfg.env, cfg.method)  # are there such ones?
     for names, good, what in (
         ("total_steps num_envs episodes hidden minibatch", lambda x: x >= 1, "1 or more"),
         ("hidden minibatch episodes", lambda x: x <= 10_000, "at most 10000"),
@@ -111,19 +149,10 @@ def from_command_line(argv: list[str]) -> LocomotionConfig:
             raise UsageError(bad)
     if cfg.backtracking.trace_length and (problem := cfg.backtracking.problem()):
         raise UsageError(f"--backtracking: {problem} (a trace_length of 0 is the agent alone)")
-    return cfg
 
 
-def train(cfg: LocomotionConfig, folder: Path) -> float:
-    """Learn to run; writes `metrics.csv` and `policy.pt` (the policy's state_dict, with TRPO also
-    mean and variance that its observations are normalised by) into the run folder.
-
-    Args:
-        cfg: settings.
-        folder: the run folder.
-
-    Returns:
-        The last measured return of the deterministic policy.
+def make(cfg: LocomotionConfig) -> tuple[Any, Any]:
+    """The agent, with the environments that it learns in, and an environment to measure it in.
 
     Raises:
         UsageError: if the extra `sb3` is missing.
@@ -133,10 +162,7 @@ def train(cfg: LocomotionConfig, folder: Path) -> float:
         from sb3_contrib import TRPO
         from stable_baselines3 import SAC
         from stable_baselines3.common.env_util import make_vec_env
-        from stable_baselines3.common.evaluation import evaluate_policy
-        from stable_baselines3.common.vec_env import VecNormalize, sync_envs_normalization
-
-        from goalgan_bt.sb3 import RecallTraces
+        from stable_baselines3.common.vec_env import VecNormalize
     except ImportError:
         raise UsageError('locomotion needs the extra sb3: pip install "goalgan_bt[sb3]"') from None
     torch.set_num_threads(1)
@@ -157,20 +183,52 @@ def train(cfg: LocomotionConfig, folder: Path) -> float:
     if cfg.method == "trpo":  # as rllab's, it sees normalised observations
         env, test_env = VecNormalize(env), VecNormalize(test_env, training=False, norm_reward=False)
         steps = max(1, BATCH // cfg.num_envs)
-        agent: Any = TRPO("MlpPolicy", env, n_steps=steps, **common)
-    else:
-        agent = SAC("MlpPolicy", env, **common)
+        return TRPO("MlpPolicy", env, n_steps=steps, **common), test_env
+    return SAC("MlpPolicy", env, **common), test_env
+
+
+def train(cfg: LocomotionConfig, folder: Path) -> float:
+    """Learn to run; writes `metrics.csv` into the run folder, `checkpoint.pt` with every
+    measurement, and at the end in its place `policy.pt` (the policy's state_dict, with TRPO also
+    mean and variance that its observations are normalised by).
+
+    Args:
+        cfg: settings; goes on from the folder's checkpoint if they say so.
+        folder: the run folder.
+
+    Returns:
+        The last measured return of the deterministic policy.
+
+    Raises:
+        UsageError: if the extra `sb3` is missing.
+        RunError: if there is no checkpoint to go on from, or it cannot be used.
+    """
+    agent, test_env = make(cfg)  # it tells if what follows is missing
+    import torch
+    from stable_baselines3.common.evaluation import evaluate_policy
+    from stable_baselines3.common.vec_env import sync_envs_normalization
+
+    from goalgan_bt import checkpoint
+    from goalgan_bt.sb3 import RecallTraces
+
     traced = cfg.backtracking.trace_length > 0
     recall = RecallTraces(cfg.backtracking, cfg.seed) if traced else None
 
-    records = Record(folder)
-    began, tested, reports, mean = time.perf_counter(), 0, 0, float("nan")
+    reports, tested, seconds, mean = 0, 0, 0.0, float("nan")
+    if cfg.resume is not None:
+        with checkpoint.saved(folder) as state:
+            restore(agent, recall, state)
+            reports, tested, seconds = (state[name] for name in ("reports", "tested", "seconds"))
+            fresh = np.random.SeedSequence((cfg.seed, reports)).generate_state(1)
+            agent.set_random_seed(int(fresh[0]))  # or it would draw what it drew at first
+    records = Record(folder, reports)
+    began = time.perf_counter() - seconds
     while agent.num_timesteps < cfg.total_steps:
         reports += 1
         wanted = cfg.total_steps * reports // REPORTS - agent.num_timesteps
         agent.learn(max(1, wanted), callback=recall, reset_num_timesteps=False)
         if cfg.method == "trpo":
-            sync_envs_normalization(env, test_env)
+            sync_envs_normalization(agent.get_env(), test_env)
         found: Any = evaluate_policy(agent, test_env, cfg.episodes, return_episode_rewards=True)
         returns, lengths = found
         tested, mean = tested + sum(lengths), sum(returns) / len(returns)
@@ -187,27 +245,78 @@ def train(cfg: LocomotionConfig, folder: Path) -> float:
         if recall is not None:
             row |= {f"recall/{name}": value for name, value in recall.last.items()}
         records.metrics(row)
+        done = {"reports": reports, "tested": tested, "seconds": seconds}
+        checkpoint.save(done | state_dict(agent, recall), folder)
         left = seconds * max(0.0, cfg.total_steps / agent.num_timesteps - 1)
         say(f"steps {agent.num_timesteps:,}  return {mean:.1f}  left {left / 60:.0f} min")
-    state = {"policy": agent.policy.state_dict()}
+    learned = {"policy": agent.policy.state_dict()}
     if cfg.method == "trpo":  # what its observations are normalised by
-        state |= {
-            "mean": torch.from_numpy(env.obs_rms.mean),
-            "var": torch.from_numpy(env.obs_rms.var),
+        learned |= {
+            "mean": torch.from_numpy(test_env.obs_rms.mean),
+            "var": torch.from_numpy(test_env.obs_rms.var),
         }
-    record.write_atomically(folder / "policy.pt", lambda file: torch.save(state, file))
+    record.write_atomically(folder / "policy.pt", lambda file: torch.save(learned, file))
     records.close("complete")
+    (folder / "checkpoint.pt").unlink()  # it holds all that SAC has seen
     return mean
+
+
+def state_dict(agent: Any, recall: Any) -> dict[str, Any]:
+    """What an agent and its callback (or None) need to go on, as tensors and plain values."""
+    import torch
+
+    state = {"parameters": agent.get_parameters(), "steps": agent.num_timesteps}
+    if (normalising := agent.get_vec_normalize_env()) is not None:
+        for name, moments in _moments(normalising).items():
+            mean, var = torch.as_tensor(moments.mean), torch.as_tensor(moments.var)
+            state[name] = {"mean": mean, "var": var, "count": float(moments.count)}
+    if (replay := getattr(agent, "replay_buffer", None)) is not None:
+        seen = {name: torch.from_numpy(getattr(replay, name)[: replay.size()]) for name in REPLAY}
+        state["replay"] = seen | {"pos": replay.pos, "full": replay.full}
+        state["log_ent_coef"] = agent.log_ent_coef.detach()
+    if recall is not None and recall.trajectories:
+        state["recall"] = recall.state_dict()
+    return state
+
+
+def restore(agent: Any, recall: Any, state: dict[str, Any]) -> None:
+    """Put what `state_dict` gave into an agent of the same settings and its callback (or None)."""
+    agent.set_parameters(state["parameters"])
+    agent.num_timesteps = state["steps"]
+    if (normalising := agent.get_vec_normalize_env()) is not None:
+        for name, moments in _moments(normalising).items():
+            known = state[name]
+            moments.mean, moments.var = known["mean"].numpy(), known["var"].numpy()
+            moments.count = known["count"]
+    if "replay" in state:
+        replay, seen = agent.replay_buffer, state["replay"]
+        for name in REPLAY:
+            getattr(replay, name)[: len(seen[name])] = seen[name].numpy()
+        replay.pos, replay.full = seen["pos"], seen["full"]
+        agent.log_ent_coef.data.copy_(state["log_ent_coef"])
+    if "recall" in state:
+        recall.load_state_dict(state["recall"])
+
+
+def _moments(normalising: Any) -> dict[str, Any]:
+    return {"observations": normalising.obs_rms, "returns": normalising.ret_rms}
 
 
 def main() -> int:
     """The command line; returns the exit code."""
+    folder: Path | None = None
 
     def work() -> None:
+        nonlocal folder
         cfg = from_command_line(sys.argv[1:])
-        folder = record.new_run(cfg.out, cfg.env, cfg.seed, asdict(cfg))
+        folder = cfg.resume or record.new_run(cfg.out, cfg.env, cfg.seed, asdict(cfg))
         say(f"run folder: {folder}")
         found = train(cfg, folder)
         say(f"return {found:.1f} at the end of training: {folder}")
 
-    return exit_code(work)
+    def how_to_go_on() -> str:
+        if folder is None or not (folder / "checkpoint.pt").exists():
+            return "nothing was saved yet: start again"
+        return f"go on from the last measurement with --resume {folder}"
+
+    return exit_code(work, how_to_go_on)

@@ -20,14 +20,19 @@ import platform
 import subprocess
 import sys
 import time
+import types
+import typing
 from collections.abc import Sequence
+from dataclasses import fields, is_dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from goalgan_bt.envs.maze import Maze
+
+T = TypeVar("T")
 
 ENDED = "ended.txt"
 PACKAGES = ("goalgan_bt", "mujoco", "numpy", "torch", "gymnasium", "gymnasium-robotics", "tyro")
@@ -110,6 +115,51 @@ def write_settings(folder: Path, settings: dict[str, Any]) -> None:
     """Write the resolved settings to `config.json`."""
     text = json.dumps(settings, indent=2, default=str) + "\n"
     write_atomically(folder / "config.json", lambda file: file.write(text.encode()))
+
+
+def read_settings(kind: type[T], folder: Path) -> T:
+    """The settings in `config.json`, as the dataclass that they were.
+
+    Raises:
+        RunError: if the folder is no run, or they cannot be read.
+    """
+    path = folder / "config.json"
+    try:
+        return _build(kind, json.loads(path.read_text()))
+    except FileNotFoundError:
+        raise RunError(f"{folder} is no run: it has no config.json") from None
+    except (OSError, ValueError, TypeError) as error:
+        raise RunError(f"cannot read {path}: {error}") from None
+
+
+def _build(kind: type[T], values: Any) -> T:
+    """A dataclass from what `asdict` and JSON made of it."""
+    if not isinstance(values, dict):
+        raise TypeError(f"expected settings, found {values!r}")
+    hints = typing.get_type_hints(kind)
+    known = {f.name for f in fields(typing.cast(Any, kind))}
+    if unknown := set(values) - known:
+        raise ValueError(f"unknown settings {', '.join(sorted(unknown))}")
+    return kind(**{name: _convert(hints[name], value) for name, value in values.items()})
+
+
+def _convert(hint: Any, value: Any) -> Any:
+    if is_dataclass(hint):
+        return _build(typing.cast(type[Any], hint), value)
+    if value is not None and (
+        hint is Path or (isinstance(hint, types.UnionType) and Path in typing.get_args(hint))
+    ):
+        return Path(value)
+    return tuple(value) if isinstance(value, list) else value
+
+
+def env_of(folder: Path) -> str:
+    """The environment of a run; none, "", where that cannot be read: who reads all of its settings
+    tells why."""
+    try:
+        return str(json.loads((folder / "config.json").read_text())["env"])
+    except (OSError, ValueError, TypeError, KeyError):
+        return ""
 
 
 class Record:

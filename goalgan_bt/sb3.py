@@ -388,8 +388,8 @@ class RecallTraces(BaseCallback):
             kl = new_kl
         return {"loss": loss, "kl": kl, "log_pi": log_pi}
 
-    def save(self, path: Path | str) -> None:
-        """Write settings, model and trajectories, to go on with a saved agent (`load`).
+    def state_dict(self) -> dict[str, Any]:
+        """Settings, model and trajectories, to go on with a saved agent.
 
         Raises:
             ValueError: if nothing was learned yet.
@@ -397,7 +397,7 @@ class RecallTraces(BaseCallback):
         if self.dynamics is None or not self.trajectories:
             raise ValueError("nothing was learned yet: save after `learn`")
         moments = self._optimiser.state_dict() if self._agent is not None else self._moments
-        state = {
+        return {
             "cfg": asdict(self.cfg),
             "model": self.dynamics.state_dict(),
             "model_optimiser": self.dynamics.optimiser.state_dict(),
@@ -407,7 +407,26 @@ class RecallTraces(BaseCallback):
                 for one in self.trajectories
             ],
         }
-        torch.save(state, path)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` gave, but for the settings; before `learn`."""
+        for obs, actions, rewards, terminated in state["trajectories"]:
+            one = Trajectory(obs.numpy(), actions.numpy(), rewards.numpy(), terminated)
+            self.trajectories.append(one)
+            self._remembered += len(one.rewards)
+        first = self.trajectories[0]
+        self.dynamics = self._new_model(first.obs.shape[1], first.actions.shape[1])
+        self.dynamics.load_state_dict(state["model"])
+        restore(self.dynamics.optimiser, state["model_optimiser"])
+        self._moments = state["optimiser"]
+
+    def save(self, path: Path | str) -> None:
+        """Write the `state_dict`, to go on with a saved agent (`load`).
+
+        Raises:
+            ValueError: if nothing was learned yet.
+        """
+        torch.save(self.state_dict(), path)
 
     @classmethod
     def load(
@@ -422,13 +441,5 @@ class RecallTraces(BaseCallback):
         """
         state = torch.load(path, weights_only=True)
         callback = cls(cfg or RecallConfig(**state["cfg"]), seed)
-        for obs, actions, rewards, terminated in state["trajectories"]:
-            one = Trajectory(obs.numpy(), actions.numpy(), rewards.numpy(), terminated)
-            callback.trajectories.append(one)
-            callback._remembered += len(one.rewards)
-        first = callback.trajectories[0]
-        callback.dynamics = callback._new_model(first.obs.shape[1], first.actions.shape[1])
-        callback.dynamics.load_state_dict(state["model"])
-        restore(callback.dynamics.optimiser, state["model_optimiser"])
-        callback._moments = state["optimiser"]
+        callback.load_state_dict(state)
         return callback

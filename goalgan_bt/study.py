@@ -40,6 +40,7 @@ SHIPPED = Path(__file__).parent / "studies"
 KEY = ("env", "method", "seed")
 OURS = {"--env", "--seed", "--out", "--resume", "--viz", "--threads", "--help", "-h"}
 COSTS = (*KEY, "flags", "commit", "train", "label", "eval", "seconds")  # of costs.csv
+UNSEEN = "--viz", "none"  # there is a page for each run of a maze, else
 TRAININGS: list["subprocess.Popen[str]"] = []  # what this process runs at present
 
 
@@ -158,7 +159,7 @@ def grid(study: Study) -> list[Run]:
 def words(run: Run) -> list[str]:
     """The flags of `goalgan_bt.train` for a run."""
     named = ["--env", *shlex.split(run.env), "--seed", str(run.seed)]
-    alone = [] if config.other_learner(named) else ["--threads", "1", "--viz", "none"]
+    alone = [] if config.other_learner(named) else ["--threads", "1", *UNSEEN]
     return [*named, *alone, *shlex.split(run.flags)]
 
 
@@ -196,10 +197,11 @@ def perform(run: Run, folder: Path) -> Path:
         return whole[-1]
     if begun := sorted(folder.glob("*/checkpoint.pt")):
         place = begun[-1].parent
-        asked = settings(run)
-        if replace(config.load(place), out=asked.out, resume=None) != asked:
+        asked, resume = settings(run), ["--resume", str(place)]
+        other = config.other_learner(resume)
+        if replace((other or config).load(place), out=asked.out, resume=None) != asked:
             raise record.RunError(f"{place} was begun with other settings: remove it")
-        flags = ["--resume", str(place), "--viz", "none"]
+        flags = resume if other else [*resume, *UNSEEN]
     folder.mkdir(parents=True, exist_ok=True)
     with subprocess.Popen(
         [sys.executable, "-m", "goalgan_bt.train", *flags],
@@ -395,7 +397,7 @@ def work() -> None:
 
 def main() -> int:
     """The command line; returns the exit code."""
-    return exit_code(work, "the same command goes on with what is missing")
+    return exit_code(work, lambda: "the same command goes on with what is missing")
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ import pytest
 from goalgan_bt import config, envs
 from goalgan_bt.command_line import UsageError
 from goalgan_bt.config import ConfigError
+from goalgan_bt.record import RunError
 
 
 @pytest.mark.parametrize("name", envs.NAMES)
@@ -55,7 +56,7 @@ def test_the_command_line_overrides_the_preset(env):
     ],
 )
 def test_bad_flags_are_one_clear_line(flags, message):
-    with pytest.raises(UsageError) as error:
+    with pytest.raises((UsageError, RunError)) as error:
         config.from_command_line(flags)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
@@ -82,7 +83,7 @@ def test_resume_starts_from_the_runs_settings(tmp_path):
 )
 def test_damaged_settings_are_refused(tmp_path, text):
     (tmp_path / "config.json").write_text(text)
-    with pytest.raises(ConfigError) as error:
+    with pytest.raises((ConfigError, RunError)) as error:
         config.load(tmp_path)
     assert "\n" not in str(error.value)
 

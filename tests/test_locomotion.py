@@ -1,7 +1,13 @@
 """TRPO and SAC on locomotion from the command line, with and without recall traces."""
 
 import csv
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from conftest import run_module
@@ -44,6 +50,78 @@ def test_a_run_of_the_hopper(method, steps, tmp_path):
     assert drawn.returncode == 0 and (folder / "curves.png").stat().st_size > 10_000
     watched = run_module("viz", folder)
     assert watched.returncode == 2 and "hopper has no map" in watched.stderr
+
+
+@pytest.mark.parametrize("method", ["trpo", "sac"])
+def test_a_run_that_is_stopped_goes_on(method, tmp_path):
+    """From its last measurement, to the same number of steps, with all that it had learned."""
+    pytest.importorskip("sb3_contrib")
+    steps = {"trpo": 6 * 4096, "sac": 2500}[method]
+    flags = "--env", "hopper", "--method", method, "--total-steps", steps, "--out", tmp_path
+    words = [sys.executable, "-m", "goalgan_bt.train", *map(str, flags + SHORT)]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as running:
+        while not list(tmp_path.glob("*/checkpoint.pt")):
+            assert running.poll() is None
+            time.sleep(0.05)
+        running.send_signal(signal.SIGTERM)
+        _, said = running.communicate(timeout=20)
+    (folder,) = tmp_path.iterdir()
+    assert running.returncode == 2 and said.count("\n") == 1
+    assert said.endswith(f"go on from the last measurement with --resume {folder}\n")
+    saved = torch.load(folder / "checkpoint.pt", weights_only=True)
+    assert 0 < saved["steps"] < steps and saved["parameters"]["policy"]
+    if method == "sac":
+        assert len(saved["replay"]["rewards"]) == saved["steps"]
+
+    refused = run_module("train", "--resume", folder, "--hidden", 8)
+    assert refused.returncode == 2 and "--resume takes no other flag" in refused.stderr
+    done = run_module("train", "--resume", folder)
+    assert done.returncode == 0, done.stderr
+    with (folder / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["iteration"]) for row in rows] == list(range(1, len(rows) + 1))
+    counts = [int(row["steps/train"]) for row in rows]
+    assert counts[saved["reports"] - 1] == saved["steps"] and counts == sorted(set(counts))
+    assert counts[-1] >= steps and (folder / "policy.pt").exists()
+    assert not (folder / "checkpoint.pt").exists()
+    again = run_module("train", "--resume", folder)
+    assert again.returncode == 2 and "has no checkpoint.pt" in again.stderr
+
+
+@pytest.mark.parametrize("method", ["trpo", "sac"])
+def test_what_is_restored_is_what_was_saved(method, tmp_path):
+    """Agent, normalisation, replay and callback: they act and learn alike from there on."""
+    sb3 = pytest.importorskip("sb3_contrib") and pytest.importorskip("goalgan_bt.sb3")
+    cfg = locomotion.preset("hopper", method).backtracking
+    cfg = replace(cfg, min_steps=20, every=100)
+    agents = []
+    for seed in (0, 1):
+        agent, _ = locomotion.make(replace(locomotion.preset("hopper", method), seed=seed))
+        agents.append((agent, sb3.RecallTraces(cfg, seed)))
+    (agent, recall), (other, another) = agents
+    agent.learn(1000, callback=recall)
+    file = tmp_path / "state.pt"
+    torch.save(locomotion.state_dict(agent, recall), file)
+    locomotion.restore(other, another, torch.load(file, weights_only=True))
+    assert other.num_timesteps == agent.num_timesteps
+    obs = np.random.default_rng(0).normal(size=(5, 11))
+    for env in filter(None, (agent.get_vec_normalize_env(),)):
+        seen = other.get_vec_normalize_env()
+        np.testing.assert_array_equal(seen.normalize_obs(obs), env.normalize_obs(obs))
+        np.testing.assert_array_equal(seen.ret_rms.var, env.ret_rms.var)
+    first = agent.predict(obs, deterministic=True)[0]
+    np.testing.assert_array_equal(other.predict(obs, deterministic=True)[0], first)
+    assert another.best()[1] == recall.best()[1]
+    models = recall.dynamics.parameters(), another.dynamics.parameters()
+    assert all(torch.equal(a, b) for a, b in zip(*models, strict=True))
+    if method == "sac":  # replay, moments and temperature: it learns the same from there
+        other.set_logger(agent.logger)
+        for learner in (agent, other):
+            learner.set_random_seed(0)
+            learner.train(gradient_steps=3, batch_size=32)
+        weights = agent.policy.parameters(), other.policy.parameters()
+        assert all(torch.allclose(a, b) for a, b in zip(*weights, strict=True))
+        assert torch.equal(agent.log_ent_coef, other.log_ent_coef)
 
 
 def test_without_traces_nothing_is_recalled(tmp_path):

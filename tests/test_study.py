@@ -8,12 +8,13 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 from conftest import run_module
 
-from goalgan_bt import study
+from goalgan_bt import checkpoint, locomotion, record, study
 from goalgan_bt.command_line import UsageError
 
 evidence = pytest.importorskip("goalgan_bt.evidence")
@@ -252,6 +253,28 @@ def test_an_interrupted_study_ends_its_trainings(tmp_path, number, code):
     assert len(list(tmp_path.glob("runs/**/metrics.csv"))) == 2  # no run was begun twice
     for metrics in begun:
         assert metrics.read_text().splitlines()[-1].startswith("20,")
+
+
+def test_locomotion_that_was_cut_off_goes_on(tmp_path):
+    pytest.importorskip("stable_baselines3")
+    flags = "--method sac --total-steps 200 --backtracking.trace-length 0 --episodes 1"
+    run = study.Run("hopper", "sac", 0, flags)
+    cfg = replace(study.settings(run), out=tmp_path)
+    folder = record.new_run(tmp_path, "hopper", 0, asdict(cfg))
+    agent, _ = locomotion.make(cfg)
+    agent.learn(80)
+    done = {"reports": 10, "tested": 0, "seconds": 1.0}
+    checkpoint.save(done | locomotion.state_dict(agent, None), folder)
+    assert study.perform(run, tmp_path) == folder
+    _, rows = record.read_metrics(folder)
+    assert rows[0]["iteration"] == "11" and rows[0]["steps/train"] == "88"
+    assert rows[-1]["iteration"] == "25" and rows[-1]["steps/train"] == "200"
+
+    agent.learn(1)
+    checkpoint.save(done | locomotion.state_dict(agent, None), folder)
+    (folder / record.ENDED).unlink()
+    with pytest.raises(record.RunError, match="begun with other settings"):
+        study.perform(run._replace(flags=flags + " --hidden 8"), tmp_path)
 
 
 def test_a_report_names_its_commits():

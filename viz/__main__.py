@@ -8,10 +8,8 @@ if __name__ == "__main__":  # a page has nothing to lose: it goes at once, witho
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
     signal.signal(signal.SIGTERM, lambda *_: os._exit(2))
 
-import contextlib
 import importlib.util
 import ipaddress
-import json
 import socket
 import threading
 from dataclasses import dataclass
@@ -22,6 +20,7 @@ import tyro
 from goalgan_bt import config
 from goalgan_bt.command_line import UsageError, parse
 from goalgan_bt.progress import complain, say
+from goalgan_bt.record import env_of
 from goalgan_bt.viz.child import free_port
 
 
@@ -67,10 +66,7 @@ def check(folder: Path) -> None:
     Raises:
         UsageError: if the run's learner draws none.
     """
-    env = ""
-    with contextlib.suppress(OSError, ValueError, TypeError, KeyError):  # told of by who reads it
-        env = str(json.loads((folder / "config.json").read_text())["env"])
-    if config.other_learner(["--env", env]):
+    if config.other_learner(["--env", env := env_of(folder)]):
         raise UsageError(f"{env} has no map: python -m goalgan_bt.plot draws the run's curve")
 
 
