@@ -197,13 +197,14 @@ def _commits(costs: list[dict[str, str]]) -> str:
     """The commit of most runs, and which methods were run with others."""
     methods: dict[str, list[str]] = {}
     for row in costs:
-        commit, dirty = row["commit"][:12], "-dirty" * row["commit"].endswith("-dirty")
-        methods.setdefault(commit + dirty or "unknown", []).append(row["method"])
+        of = row["commit"].split("+")  # more than one where a run was resumed with other code
+        short = (one[:12] + "-dirty" * one.endswith("-dirty") for one in of)
+        methods.setdefault("+".join(short) or "unknown", []).append(row["method"])
     most, *others = sorted(methods, key=lambda commit: -len(methods[commit]))
     text = f"Commit: {most}"
     for commit in others:
-        of = methods[commit]
-        text += f"; {commit} for {len(of)} of the runs of {', '.join(dict.fromkeys(of))}"
+        some = methods[commit]
+        text += f"; {commit} for {len(some)} of the runs of {', '.join(dict.fromkeys(some))}"
     return f"{text}."
 
 

@@ -2,7 +2,7 @@
 
 runs/<env>-<time>-s<seed>/
     config.json       the resolved settings
-    meta.json         versions, git commit, command line, the maze as text
+    meta.json         versions, git commit, command line, the maze as text; what it was resumed with
     metrics.csv       a row per iteration; columns may be added while it grows
     frames/000010.npz a report: goals, labels, replay, traces, coverage (see `Record.frame`)
     checkpoint.pt     the whole training state (see `goalgan_bt.checkpoint`)
@@ -101,14 +101,32 @@ def write_meta(folder: Path, maze: Maze | None) -> None:
         except metadata.PackageNotFoundError:
             versions[package] = "not installed"
     meta = {
-        "argv": sys.argv[1:],
-        "commit": code_commit(Path(__file__).parent),
+        **_call(),
         "python": platform.python_version(),
         "cores": len(os.sched_getaffinity(0)),
         "versions": versions,
         "maze": None if maze is None else {"rows": maze.rows, "cell_size": maze.cell_size},
     }
     (folder / "meta.json").write_text(json.dumps(meta, indent=2) + "\n")
+
+
+def _call() -> dict[str, Any]:
+    return {"argv": sys.argv[1:], "commit": code_commit(Path(__file__).parent)}
+
+
+def _note_resumed(folder: Path) -> None:
+    """Add to `meta.json` what a run is taken up with: the code may be another by now."""
+    meta = read_meta(folder)
+    meta["resumed"] = [*meta.get("resumed", []), _call()]
+    text = json.dumps(meta, indent=2) + "\n"
+    write_atomically(folder / "meta.json", lambda file: file.write(text.encode()))
+
+
+def commits(folder: Path) -> str:
+    """The commits of the code that a run was made with, in order, with "+" between them."""
+    meta = read_meta(folder)
+    calls = [meta, *meta.get("resumed", [])]
+    return "+".join(dict.fromkeys(call["commit"] or "unknown" for call in calls))
 
 
 def write_settings(folder: Path, settings: dict[str, Any]) -> None:
@@ -180,6 +198,8 @@ class Record:
             raise RunError(f"{folder} is being trained by another process: wait for it") from None
         self._rows: list[dict[str, str]] = []
         self._columns: list[str] = []
+        if iteration:
+            _note_resumed(folder)
         (folder / "frames").mkdir(exist_ok=True)
         (folder / ENDED).unlink(missing_ok=True)
         if (folder / "metrics.csv").exists():

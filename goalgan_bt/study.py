@@ -287,7 +287,7 @@ class Tables:
         last = rows[-1]
         self.costs.append(
             key
-            | {"flags": run.flags, "commit": record.read_meta(folder)["commit"] or ""}
+            | {"flags": run.flags, "commit": record.commits(folder)}
             | {kind: last[f"steps/{kind}"] for kind in ("train", "label", "eval")}
             | {"seconds": f"{float(last['time/total']):.0f}"}
         )

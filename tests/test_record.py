@@ -34,6 +34,7 @@ def test_columns_grow_without_losing_a_value(tmp_path):
 
 
 def test_a_resumed_record_drops_what_came_after_its_checkpoint(tmp_path):
+    record.write_meta(tmp_path, None)
     records = Record(tmp_path)
     for i in range(1, 6):
         records.metrics(row(i))
@@ -131,6 +132,16 @@ def test_meta_holds_the_maze_and_the_versions(tmp_path):
     assert meta["versions"]["mujoco"][0].isdigit()
 
 
+def test_a_run_that_is_taken_up_with_other_code_says_so(tmp_path, monkeypatch):
+    for commit, iteration in (("first", 0), ("first", 2), ("second", 5)):
+        monkeypatch.setattr(record, "code_commit", lambda _, commit=commit: commit)
+        if not iteration:
+            record.write_meta(tmp_path, None)
+        Record(tmp_path, iteration).close("killed")
+    assert record.commits(tmp_path) == "first+second"
+    assert len(record.read_meta(tmp_path)["resumed"]) == 2
+
+
 @pytest.mark.parametrize("read", [record.read_metrics, record.read_meta])
 def test_a_folder_that_is_no_run_says_so(tmp_path, read):
     with pytest.raises(RunError, match="is no run"):
@@ -145,6 +156,7 @@ def test_a_run_without_a_report_yet_says_so(tmp_path):
 
 def test_tensorboard_forgets_what_a_resumed_run_does_again(tmp_path):
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    record.write_meta(tmp_path, None)
     first = Record(tmp_path)
     for i in (1, 2, 3):
         first.metrics({"iteration": i, "steps/train": 100 * i, "trpo/kl": 0.1 * i})

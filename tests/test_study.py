@@ -269,6 +269,8 @@ def test_locomotion_that_was_cut_off_goes_on(tmp_path):
     _, rows = record.read_metrics(folder)
     assert rows[0]["iteration"] == "11" and rows[0]["steps/train"] == "88"
     assert rows[-1]["iteration"] == "25" and rows[-1]["steps/train"] == "200"
+    (resumed,) = record.read_meta(folder)["resumed"]
+    assert resumed["argv"] == ["--resume", str(folder)]
 
     agent.learn(1)
     checkpoint.save(done | locomotion.state_dict(agent, None), folder)
@@ -284,9 +286,10 @@ def test_a_report_names_its_commits():
     ours, other = 40 * "a", 40 * "b"
     assert evidence._commits([row(ours, "x")]) == f"Commit: {ours[:12]}."
     several = [row(f"{other}-dirty", "y"), row(ours, "x"), row(ours, "y"), row("", "z")]
+    several.append(row(f"{ours}+{other}", "z"))  # resumed
     assert evidence._commits(several) == (
         f"Commit: {ours[:12]}; {other[:12]}-dirty for 1 of the runs of y; "
-        "unknown for 1 of the runs of z."
+        f"unknown for 1 of the runs of z; {ours[:12]}+{other[:12]} for 1 of the runs of z."
     )
 
 
