@@ -477,11 +477,5 @@ def how_to_go_on(folder: Path | None) -> str:
     return f": go on from the last checkpoint with --resume {folder}"
 
 
-def script() -> None:
-    """Entry point of the `goalgan-bt` command."""
-    other = config.other_learner(sys.argv)
-    sys.exit(other.main() if other else main())
-
-
 if __name__ == "__main__":
-    script()
+    sys.exit(main())
