@@ -14,9 +14,16 @@ if TYPE_CHECKING:
     from goalgan_bt.learner import Learner
 
 
-def save(state: dict[str, Any], folder: Path) -> None:
-    """Write `checkpoint.pt`; the old one stays in place until the new one is complete."""
-    write_atomically(folder / "checkpoint.pt", lambda file: torch.save(state, file))
+def save(state: dict[str, Any], path: Path) -> None:
+    """Write a state; an old one stays in place until the new one is complete.
+
+    Raises:
+        OSError: where that fails, as on a full disk.
+    """
+    try:
+        write_atomically(path, lambda file: torch.save(state, file))
+    except RuntimeError as error:  # of torch's archive, which hides what stopped it
+        raise (error.__context__ or error) from None
 
 
 def load(learner: "Learner", folder: Path) -> None:

@@ -76,7 +76,7 @@ def exit_code(
 
     Args:
         work: what to do.
-        interrupted: tells what to do where it is interrupted.
+        interrupted: tells how to go on, where the work was cut short.
     """
     asked = signal.SIGINT
 
@@ -95,9 +95,13 @@ def exit_code(
     except MemoryError:
         complain("out of memory: use smaller settings")
         return 2
+    except BrokenPipeError:
+        sys.stdout = sys.stderr  # nobody reads standard output any more
+        complain(f"standard output was closed: {interrupted()}")
+        return 2
     except OSError as error:
         full = error.errno == errno.ENOSPC
-        complain(f"the disk is full: free some space; {interrupted()}" if full else str(error))
+        complain(f"{'the disk is full: free some space' if full else error}; {interrupted()}")
         return 2
     except (UsageError, RunError) as error:
         complain(str(error))

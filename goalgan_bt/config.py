@@ -282,12 +282,12 @@ def from_command_line(argv: list[str] | None = None) -> Config:
     if run is None and (method := value_of(argv, "--method")) is not None:
         default = with_method(default, method)
     cfg = parse(Config, argv, "python -m goalgan_bt.train", default)
-    check(cfg)
     if run is not None:
         for name in FIXED:
             if getattr(cfg, name) != getattr(default, name):
                 flag = "--" + name.replace("_", "-")
                 raise ConfigError(f"{flag} of a run cannot change when it is resumed: drop it")
+    check(cfg)
     return cfg
 
 
@@ -304,7 +304,7 @@ def load(folder: Path) -> Config:
         RunError: if the folder is no run or its settings cannot be read.
     """
     if other_learner(["--env", env := env_of(folder)]):
-        raise ConfigError(f"{folder}: runs of {env} leave nothing to go on from: start again")
+        raise ConfigError(f"{folder} is a run of {env}, no maze: nothing of it can be loaded here")
     cfg = read_settings(Config, folder)
     try:
         check(cfg)

@@ -32,9 +32,9 @@ TRACE_LENGTH = {"half_cheetah": 20, "walker2d": 20, "hopper": 20, "ant": 50, "hu
 TRPO_TRACE_LENGTH = TRACE_LENGTH | {"hopper": 10}
 REPORTS = 25  # per run
 BATCH = 4096  # steps of a TRPO update
-SEEDS = 1000  # environments of one run have seeds of their own, which no other run has
-# Without contact forces: zero nearly always, they are no part of what a model can unroll.
+SEEDS = 1000  # more than a run has environments
 REPLAY = "observations", "next_observations", "actions", "rewards", "dones", "timeouts"
+# Without contact forces: zero nearly always, they are no part of what a model can unroll.
 PLAIN: dict[str, dict[str, Any]] = {
     "ant": {"include_cfrc_ext_in_observation": False},
     "humanoid": {"include_cfrc_ext_in_observation": False},
@@ -116,7 +116,8 @@ def from_command_line(argv: list[str]) -> LocomotionConfig:
     cfg = parse(LocomotionConfig, argv, "python -m goalgan_bt.train", default)
     if run is not None and cfg != default:
         raise UsageError("a run of this kind goes on as it was begun: --resume takes no other flag")
-    check(cfg)
+    if run is None:
+        check(cfg)
     return cfg
 
 
@@ -124,11 +125,13 @@ def load(folder: Path) -> LocomotionConfig:
     """The settings of a run folder.
 
     Raises:
-        UsageError: for bad ones.
-        RunError: if the folder is no run, or they cannot be read.
+        RunError: if the folder is no run, or they cannot be read or make no sense.
     """
     cfg = record.read_settings(LocomotionConfig, folder)
-    check(cfg)
+    try:
+        check(cfg)
+    except (UsageError, TypeError) as error:
+        raise record.RunError(f"cannot read {folder / 'config.json'}: {error}") from None
     return cfg
 
 
@@ -167,8 +170,8 @@ def make(cfg: LocomotionConfig) -> tuple[Any, Any]:
         raise UsageError('locomotion needs the extra sb3: pip install "goalgan_bt[sb3]"') from None
     torch.set_num_threads(1)
     plain = PLAIN.get(cfg.env, {})
-    env: Any = make_vec_env(TASKS[cfg.env], cfg.num_envs, SEEDS * cfg.seed, env_kwargs=plain)
-    # The last of its seeds: other first states than in training.
+    env: Any = make_vec_env(TASKS[cfg.env], cfg.num_envs, cfg.seed, env_kwargs=plain)
+    # Other first states than in training, whose environments have the seeds from cfg.seed on.
     test_env: Any = make_vec_env(TASKS[cfg.env], 1, SEEDS * (cfg.seed + 1) - 1, env_kwargs=plain)
     common: Any = {
         "seed": cfg.seed,
@@ -216,11 +219,9 @@ def train(cfg: LocomotionConfig, folder: Path) -> float:
 
     reports, tested, seconds, mean = 0, 0, 0.0, float("nan")
     if cfg.resume is not None:
-        with checkpoint.saved(folder) as state:
-            restore(agent, recall, state)
-            reports, tested, seconds = (state[name] for name in ("reports", "tested", "seconds"))
-            fresh = np.random.SeedSequence((cfg.seed, reports)).generate_state(1)
-            agent.set_random_seed(int(fresh[0]))  # or it would draw what it drew at first
+        reports, tested, seconds, mean = resume(agent, recall, folder)
+        fresh = np.random.SeedSequence((cfg.seed, reports)).generate_state(1)
+        agent.set_random_seed(int(fresh[0]))  # or it would draw what it drew at first
     records = Record(folder, reports)
     began = time.perf_counter() - seconds
     while agent.num_timesteps < cfg.total_steps:
@@ -245,20 +246,35 @@ def train(cfg: LocomotionConfig, folder: Path) -> float:
         if recall is not None:
             row |= {f"recall/{name}": value for name, value in recall.last.items()}
         records.metrics(row)
-        done = {"reports": reports, "tested": tested, "seconds": seconds}
-        checkpoint.save(done | state_dict(agent, recall), folder)
+        done = {"done": (reports, tested, seconds, float(mean))}
+        checkpoint.save(done | state_dict(agent, recall), folder / "checkpoint.pt")
         left = seconds * max(0.0, cfg.total_steps / agent.num_timesteps - 1)
         say(f"steps {agent.num_timesteps:,}  return {mean:.1f}  left {left / 60:.0f} min")
     learned = {"policy": agent.policy.state_dict()}
-    if cfg.method == "trpo":  # what its observations are normalised by
-        learned |= {
-            "mean": torch.from_numpy(test_env.obs_rms.mean),
-            "var": torch.from_numpy(test_env.obs_rms.var),
-        }
-    record.write_atomically(folder / "policy.pt", lambda file: torch.save(learned, file))
+    if (normalising := agent.get_vec_normalize_env()) is not None:
+        seen = normalising.obs_rms
+        learned |= {"mean": torch.from_numpy(seen.mean), "var": torch.from_numpy(seen.var)}
+    checkpoint.save(learned, folder / "policy.pt")
     records.close("complete")
-    (folder / "checkpoint.pt").unlink()  # it holds all that SAC has seen
+    (folder / "checkpoint.pt").unlink(missing_ok=True)  # it holds all that SAC has seen
     return mean
+
+
+def resume(agent: Any, recall: Any, folder: Path) -> tuple[int, int, float, float]:
+    """Let an agent and its callback (or None) go on from a run's checkpoint.
+
+    Returns:
+        Measurements so far, their steps, seconds of the run, and the last return.
+
+    Raises:
+        RunError: if there is no checkpoint, or it cannot be used.
+    """
+    from goalgan_bt import checkpoint
+
+    with checkpoint.saved(folder) as state:
+        restore(agent, recall, state)
+        reports, tested, seconds, mean = state["done"]
+    return reports, tested, seconds, mean
 
 
 def state_dict(agent: Any, recall: Any) -> dict[str, Any]:

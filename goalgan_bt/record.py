@@ -6,6 +6,7 @@ runs/<env>-<time>-s<seed>/
     metrics.csv       a row per iteration; columns may be added while it grows
     frames/000010.npz a report: goals, labels, replay, traces, coverage (see `Record.frame`)
     checkpoint.pt     the whole training state (see `goalgan_bt.checkpoint`)
+    policy.pt         of locomotion, in the checkpoint's place when it is finished
     ended.txt         how the run ended; absent while it goes on, or where it was killed
     lock              held by the process that trains
     events.*          TensorBoard, if it is installed (extra `tensorboard`)
@@ -164,6 +165,10 @@ def _build(kind: type[T], values: Any) -> T:
 def _convert(hint: Any, value: Any) -> Any:
     if is_dataclass(hint):
         return _build(typing.cast(type[Any], hint), value)
+    if hint in (bool, int, float, str) and not isinstance(
+        value, (hint, int) if hint is float else hint
+    ):
+        raise TypeError(f"expected {hint.__name__}, found {value!r}")
     if value is not None and (
         hint is Path or (isinstance(hint, types.UnionType) and Path in typing.get_args(hint))
     ):
@@ -187,6 +192,9 @@ class Record:
         folder: the run folder.
         iteration: rows after this one are dropped, for a run that is taken up again.
         events: whether TensorBoard gets the metrics too, if it is installed.
+
+    Raises:
+        RunError: if another process trains this run, or what it holds is damaged.
     """
 
     def __init__(self, folder: Path, iteration: int = 0, events: bool = True) -> None:
@@ -322,6 +330,8 @@ def read_meta(folder: Path) -> dict[str, Any]:
         raise RunError(f"{folder} is no run: it has no meta.json") from None
     except (OSError, ValueError) as error:
         raise RunError(f"cannot read {folder / 'meta.json'}: {error}") from None
+    if not isinstance(meta, dict) or "commit" not in meta:
+        raise RunError(f"{folder / 'meta.json'} is damaged: it names no commit")
     return meta
 
 

@@ -195,12 +195,12 @@ def perform(run: Run, folder: Path) -> Path:
     flags = [*words(run), "--out", str(folder)]
     if whole := [end.parent for end in folder.glob(f"*/{record.ENDED}") if _of(end.parent, run)]:
         return whole[-1]
-    if begun := sorted(folder.glob("*/checkpoint.pt")):
-        place = begun[-1].parent
-        asked, resume = settings(run), ["--resume", str(place)]
+    begun = max((kept.parent for kept in folder.glob("*/checkpoint.pt")), default=None)
+    if begun is not None:
+        asked, resume = settings(run), ["--resume", str(begun)]
         other = config.other_learner(resume)
-        if replace((other or config).load(place), out=asked.out, resume=None) != asked:
-            raise record.RunError(f"{place} was begun with other settings: remove it")
+        if replace((other or config).load(begun), out=asked.out, resume=None) != asked:
+            raise record.RunError(f"{begun} was begun with other settings: remove it")
         flags = resume if other else [*resume, *UNSEEN]
     folder.mkdir(parents=True, exist_ok=True)
     with subprocess.Popen(
@@ -217,7 +217,7 @@ def perform(run: Run, folder: Path) -> Path:
     if training.returncode != 0 and not finished:
         last = (errors.strip().splitlines() or ["it said nothing"])[-1]
         raise record.RunError(f"{run.env}, {run.method}, seed {run.seed} failed: {last}")
-    return max(folder.glob("*/config.json"), key=os.path.getmtime).parent
+    return begun or max(folder.glob("*/config.json"), key=os.path.getmtime).parent
 
 
 def _of(place: Path, run: Run) -> bool:

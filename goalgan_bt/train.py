@@ -18,14 +18,14 @@ if __name__ == "__main__":
 
     signal.signal(signal.SIGINT, _leave)
     signal.signal(signal.SIGTERM, _leave)
-    from goalgan_bt import config
+    from goalgan_bt import command_line, config, record
 
     if other := config.other_learner(sys.argv):  # it needs none of what follows
         sys.exit(other.main())
     if {"-h", "--help"} & set(sys.argv):
         try:
             config.from_command_line()  # ends here
-        except ValueError as error:  # UsageError, or RunError of --resume
+        except (command_line.UsageError, record.RunError) as error:
             print(f"error: {error}", file=sys.stderr)
             sys.exit(2)
 
@@ -261,7 +261,7 @@ def train(cfg: Config, folder: Path | None, stop: "Stop | None" = None) -> Train
                 }
             )
             if measure:
-                checkpoint.save(learner.state_dict(), records.folder)
+                checkpoint.save(learner.state_dict(), records.folder / "checkpoint.pt")
             records.metrics(metrics)
             if measure or learner.iteration % cfg.report_every == 0:
                 left = clock.total() * max(1 / done - 1, 0) if done else np.inf

@@ -76,10 +76,21 @@ def test_resume_starts_from_the_runs_settings(tmp_path):
     assert (cfg.env, cfg.seed, cfg.iterations) == ("point_spiral", 3, 9)
     with pytest.raises(ConfigError, match="--env of a run cannot change"):
         config.from_command_line(["--resume", str(tmp_path), "--env", "ant_umaze"])
+    with pytest.raises(ConfigError, match="--env of a run cannot change"):
+        config.from_command_line(["--resume", str(tmp_path), "--env", "hopper"])
 
 
 @pytest.mark.parametrize(
-    "text", ["{", "[]", '{"nonsense": 1}', '{"trpo": 3}', '{"env": "moon"}', '{"discount": "x"}']
+    "text",
+    [
+        "{",
+        "[]",
+        '{"nonsense": 1}',
+        '{"trpo": 3}',
+        '{"env": "moon"}',
+        '{"discount": "x"}',
+        '{"seed": 1.5}',
+    ],
 )
 def test_damaged_settings_are_refused(tmp_path, text):
     (tmp_path / "config.json").write_text(text)

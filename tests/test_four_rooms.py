@@ -220,6 +220,18 @@ def test_a_run_that_is_stopped_says_so(number, code, tmp_path):
     assert said.count("\n") == 1
 
 
+def test_a_closed_standard_output_is_one_line(tmp_path):
+    flags = "--env", "four_rooms_11", "--total-steps", "4000", "--out", tmp_path
+    words = [sys.executable, "-m", "goalgan_bt.train", *map(str, flags)]
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as running:
+        running.stdout.close()
+        said = running.stderr.read()
+    assert running.returncode == 2 and said.startswith("error: standard output was closed")
+    assert said.count("\n") == 1
+
+
 def test_larger_rooms_need_recall_traces(tmp_path):
     """The paper's claim at 19 x 19: actor-critic alone does not get there, with traces it does."""
     cfg = replace(four_rooms.preset("four_rooms_19"), total_steps=200_000)

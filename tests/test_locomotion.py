@@ -5,14 +5,14 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 import torch
 from conftest import run_module
 
-from goalgan_bt import locomotion
+from goalgan_bt import checkpoint, locomotion, record
 from goalgan_bt.command_line import UsageError
 
 SHORT = "--backtracking.min-steps", 20, "--backtracking.every", 100, "--episodes", 1
@@ -81,7 +81,7 @@ def test_a_run_that_is_stopped_goes_on(method, tmp_path):
         rows = list(csv.DictReader(file))
     assert [int(row["iteration"]) for row in rows] == list(range(1, len(rows) + 1))
     counts = [int(row["steps/train"]) for row in rows]
-    assert counts[saved["reports"] - 1] == saved["steps"] and counts == sorted(set(counts))
+    assert counts[saved["done"][0] - 1] == saved["steps"] and counts == sorted(set(counts))
     assert counts[-1] >= steps and (folder / "policy.pt").exists()
     assert not (folder / "checkpoint.pt").exists()
     again = run_module("train", "--resume", folder)
@@ -122,6 +122,37 @@ def test_what_is_restored_is_what_was_saved(method, tmp_path):
         weights = agent.policy.parameters(), other.policy.parameters()
         assert all(torch.allclose(a, b) for a, b in zip(*weights, strict=True))
         assert torch.equal(agent.log_ent_coef, other.log_ent_coef)
+
+
+def test_a_run_cut_off_between_its_last_measurement_and_its_end_only_ends(tmp_path):
+    pytest.importorskip("sb3_contrib")
+    cfg = replace(locomotion.preset("hopper", "trpo"), total_steps=4096)
+    cfg = replace(cfg, backtracking=replace(cfg.backtracking, trace_length=0))
+    folder = record.new_run(tmp_path, "hopper", 0, asdict(cfg))
+    agent, _ = locomotion.make(cfg)
+    agent.learn(4096)
+    state = {"done": (25, 100, 1.0, 7.5)} | locomotion.state_dict(agent, None)
+    checkpoint.save(state, folder / "checkpoint.pt")
+    assert locomotion.train(replace(cfg, resume=folder), folder) == 7.5
+    saved = torch.load(folder / "policy.pt", weights_only=True)
+    seen = agent.get_vec_normalize_env().obs_rms
+    np.testing.assert_array_equal(saved["mean"], seen.mean)
+    np.testing.assert_array_equal(saved["var"], seen.var)
+    assert abs(seen.mean[0] - 1.2) < 0.1  # the Hopper's height
+    assert not (folder / "checkpoint.pt").exists()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"env": "moon"}, {"hidden": None}, {"seed": 1.5}, {"total_steps": -1}, {"backtracking": 3}],
+)
+def test_damaged_settings_are_refused(change, tmp_path):
+    cfg = asdict(locomotion.preset("hopper", "sac"))
+    record.write_settings(tmp_path, cfg)
+    assert locomotion.load(tmp_path) == locomotion.preset("hopper", "sac")
+    record.write_settings(tmp_path, cfg | change)
+    with pytest.raises(record.RunError, match=r"cannot read .*config.json"):
+        locomotion.load(tmp_path)
 
 
 def test_without_traces_nothing_is_recalled(tmp_path):

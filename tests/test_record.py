@@ -1,11 +1,13 @@
 import csv
+import resource
 import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from goalgan_bt import record
+from goalgan_bt import checkpoint, record
 from goalgan_bt.envs import maze as mazes
 from goalgan_bt.record import Record, RunError
 
@@ -114,6 +116,21 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path):
         record.write_atomically(path, fail)
     assert path.read_bytes() == b"old"
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_checkpoint_that_does_not_fit_on_the_disk_says_so(tmp_path):
+    """torch's archive hides what stopped it behind an error of its own."""
+    path, state = tmp_path / "checkpoint.pt", {"weights": torch.zeros(100_000)}
+    checkpoint.save({"weights": torch.ones(1)}, path)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            checkpoint.save(state, path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert torch.load(path, weights_only=True)["weights"] == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["checkpoint.pt"]
 
 
 def test_folders_of_the_same_second_do_not_collide(tmp_path):

@@ -256,15 +256,15 @@ def test_an_interrupted_study_ends_its_trainings(tmp_path, number, code):
 
 
 def test_locomotion_that_was_cut_off_goes_on(tmp_path):
-    pytest.importorskip("stable_baselines3")
+    pytest.importorskip("sb3_contrib")
     flags = "--method sac --total-steps 200 --backtracking.trace-length 0 --episodes 1"
     run = study.Run("hopper", "sac", 0, flags)
     cfg = replace(study.settings(run), out=tmp_path)
     folder = record.new_run(tmp_path, "hopper", 0, asdict(cfg))
     agent, _ = locomotion.make(cfg)
     agent.learn(80)
-    done = {"reports": 10, "tested": 0, "seconds": 1.0}
-    checkpoint.save(done | locomotion.state_dict(agent, None), folder)
+    done = {"done": (10, 0, 1.0, 0.0)}
+    checkpoint.save(done | locomotion.state_dict(agent, None), folder / "checkpoint.pt")
     assert study.perform(run, tmp_path) == folder
     _, rows = record.read_metrics(folder)
     assert rows[0]["iteration"] == "11" and rows[0]["steps/train"] == "88"
@@ -273,7 +273,7 @@ def test_locomotion_that_was_cut_off_goes_on(tmp_path):
     assert resumed["argv"] == ["--resume", str(folder)]
 
     agent.learn(1)
-    checkpoint.save(done | locomotion.state_dict(agent, None), folder)
+    checkpoint.save(done | locomotion.state_dict(agent, None), folder / "checkpoint.pt")
     (folder / record.ENDED).unlink()
     with pytest.raises(record.RunError, match="begun with other settings"):
         study.perform(run._replace(flags=flags + " --hidden 8"), tmp_path)
