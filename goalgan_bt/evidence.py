@@ -304,7 +304,12 @@ def _curves(ax: Axes, env: str, of: dict[str, dict[int, Curve]], measure: str) -
         if not seeds:
             continue
         first = max(curve.steps[0] for curve in seeds.values())
-        grid = np.linspace(first, min(curve.steps[-1] for curve in seeds.values()), 150)
+        last = min(curve.steps[-1] for curve in seeds.values())
+        measured = max(curve.steps[curve.steps > 0][0] for curve in seeds.values())
+        grid = np.linspace(first, last, 150)
+        if measured < last / 100:  # grid worlds: most of it happens at once, and is measured then
+            grid = np.geomspace(measured, last, 150)
+            ax.set_xscale("log")
         y = np.array([np.interp(grid, *curve) for curve in seeds.values()])
         bounds = np.array([interval(column) for column in y.T])
         style = _style(i)
