@@ -299,7 +299,7 @@ def draw(study: Study, runs: dict[tuple[str, str], dict[int, Curve]]) -> Figure:
 
 
 def _curves(ax: Axes, env: str, of: dict[str, dict[int, Curve]], measure: str) -> None:
-    """Interquartile mean and interval per method, and what was published."""
+    """Interquartile mean per method, with its interval if there are few, and what was published."""
     for i, (method, seeds) in enumerate(of.items()):
         if not seeds:
             continue
@@ -314,7 +314,8 @@ def _curves(ax: Axes, env: str, of: dict[str, dict[int, Curve]], measure: str) -
         bounds = np.array([interval(column) for column in y.T])
         style = _style(i)
         ax.plot(grid / 1e6, bounds[:, 0], label=f"{method} ({len(seeds)})", **style)
-        ax.fill_between(grid / 1e6, *bounds[:, 1:].T, color=style["color"], alpha=0.12, lw=0)
+        if len(of) <= 10:  # more would hide the lines; the table has the intervals
+            ax.fill_between(grid / 1e6, *bounds[:, 1:].T, color=style["color"], alpha=0.12, lw=0)
     lines = published(asdict(settings(Run(env, "", 0, ""))))
     for line, (x, side) in zip(lines, ((0, "left"), (1, "right")), strict=False):
         steps, level = line.last
