@@ -119,6 +119,7 @@ def test_same_seed_same_metrics(tmp_path):
 
 
 def test_resume_goes_on_where_the_checkpoint_was(tmp_path):
+    record.write_meta(tmp_path, None)
     train(settings("point_umaze", "--iterations", "3"), tmp_path)
     first = columns(tmp_path)
     cfg = replace(settings("point_umaze", "--iterations", "5"), resume=tmp_path)
