@@ -77,11 +77,12 @@ class AlpGmm:
         try:
             from sklearn.mixture import GaussianMixture
             from sklearn.neighbors import KDTree
+            from threadpoolctl import threadpool_limits  # scikit-learn needs it itself
         except ImportError:
             raise UsageError(
                 'alp_gmm needs scikit-learn: pip install "goalgan_bt[study]"'
             ) from None
-        self._mixture, self._tree = GaussianMixture, KDTree
+        self._mixture, self._tree, self._limits = GaussianMixture, KDTree, threadpool_limits
         self._low, self._high, self._rng = low, high, rng
         self._goals, self._success = np.empty((0, len(low))), np.empty(0)
         self._recent, self._outcomes = self._goals, self._success  # not yet in a mixture
@@ -106,7 +107,8 @@ class AlpGmm:
 
     def _fit(self) -> None:
         how = dict(reg_covar=1e-4, init_params="random_from_data", random_state=self._fit_seed)
-        mixtures = [self._mixture(k, **how).fit(self._points) for k in self.COMPONENTS]
+        with self._limits(1):  # matrices of 250 rows: threads only wait for each other
+            mixtures = [self._mixture(k, **how).fit(self._points) for k in self.COMPONENTS]
         self._fitted = min(mixtures, key=lambda mixture: mixture.aic(self._points))
 
     def state_dict(self) -> dict[str, torch.Tensor]:
