@@ -3,8 +3,9 @@
     python -m goalgan_bt.train --env four_rooms_15 --method recall_traces
 
 A tabular actor-critic with generalised advantages, the same with prioritised experience replay,
-and the same with recall traces: the backward state model q(s_t | a_t, s_{t+1}) is exact, the
-backward action model q(a_t | s_{t+1}) learned from the best trajectories, or uniform.
+and the same with recall traces: the backward state model q(s_t | a_t, s_{t+1}) knows exactly from
+which states an action leads to another, and holds them for equally likely; the backward action
+model q(a_t | s_{t+1}) is learned from the best trajectories, or uniform.
 """
 
 import re
@@ -332,7 +333,7 @@ def measure(
     return Measured(float(won.mean()), discounted, visits, batch.states.size)
 
 
-def train(cfg: FourRoomsConfig, folder: Path) -> Measured:
+def train(cfg: FourRoomsConfig, folder: Path) -> tuple[Measured, int]:
     """Learn to find the goal; writes `metrics.csv` and `visits.npz` into the run folder.
 
     Args:
@@ -340,7 +341,7 @@ def train(cfg: FourRoomsConfig, folder: Path) -> Measured:
         folder: the run folder.
 
     Returns:
-        What the policy is worth in the end.
+        What the policy is worth in the end, and the steps of training that it took.
     """
     rooms = FourRooms(cfg.size)
     rng, test_rng = (np.random.default_rng([cfg.seed, i]) for i in range(2))
@@ -404,7 +405,7 @@ def train(cfg: FourRoomsConfig, folder: Path) -> Measured:
     pictures: dict[str, Any] = {name: rooms.picture(visits) for name, visits in grids.items()}
     record.write_atomically(folder / "visits.npz", lambda file: np.savez(file, **pictures))
     records.close("complete")
-    return measured
+    return measured, steps
 
 
 TABLE = {  # the paper's settings of prioritised replay by size: batch, every, alpha, beta
@@ -463,10 +464,10 @@ def main() -> int:
         cfg = from_command_line(sys.argv[1:])
         folder = record.new_run(cfg.out, cfg.env, cfg.seed, asdict(cfg))
         say(f"run folder: {folder}")
-        measured = train(cfg, folder)
+        measured, steps = train(cfg, folder)
         seen = int((measured.visits > 0).sum())
         say(
-            f"coverage {measured.success:.3f} after {cfg.total_steps:,} training steps, return "
+            f"coverage {measured.success:.3f} after {steps:,} training steps, return "
             f"{measured.discounted:.3f}, {seen} cells visited: {folder}"
         )
 

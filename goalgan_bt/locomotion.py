@@ -9,6 +9,7 @@ gymnasium's tasks and the agents of sb3-contrib and Stable-Baselines3, with the 
 import sys
 import time
 from dataclasses import asdict, dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -154,20 +155,30 @@ def check(cfg: LocomotionConfig) -> None:
         raise UsageError(f"--backtracking: {problem} (a trace_length of 0 is the agent alone)")
 
 
+def needed() -> None:
+    """Refuse to run without the agents.
+
+    Raises:
+        UsageError: if the extra `sb3` is missing.
+    """
+    for package in ("stable_baselines3", "sb3_contrib"):
+        if find_spec(package) is None:
+            raise UsageError(f'locomotion needs {package}: pip install "goalgan_bt[sb3]"')
+
+
 def make(cfg: LocomotionConfig) -> tuple[Any, Any]:
     """The agent, with the environments that it learns in, and an environment to measure it in.
 
     Raises:
         UsageError: if the extra `sb3` is missing.
     """
-    try:
-        import torch
-        from sb3_contrib import TRPO
-        from stable_baselines3 import SAC
-        from stable_baselines3.common.env_util import make_vec_env
-        from stable_baselines3.common.vec_env import VecNormalize
-    except ImportError:
-        raise UsageError('locomotion needs the extra sb3: pip install "goalgan_bt[sb3]"') from None
+    needed()
+    import torch
+    from sb3_contrib import TRPO
+    from stable_baselines3 import SAC
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.vec_env import VecNormalize
+
     torch.set_num_threads(1)
     plain = PLAIN.get(cfg.env, {})
     env: Any = make_vec_env(TASKS[cfg.env], cfg.num_envs, cfg.seed, env_kwargs=plain)
@@ -274,7 +285,8 @@ def resume(agent: Any, recall: Any, folder: Path) -> tuple[int, int, float, floa
     with checkpoint.saved(folder) as state:
         restore(agent, recall, state)
         reports, tested, seconds, mean = state["done"]
-    return reports, tested, seconds, mean
+        done = int(reports), int(tested), float(seconds), float(mean)
+    return done
 
 
 def state_dict(agent: Any, recall: Any) -> dict[str, Any]:
@@ -298,17 +310,17 @@ def state_dict(agent: Any, recall: Any) -> dict[str, Any]:
 def restore(agent: Any, recall: Any, state: dict[str, Any]) -> None:
     """Put what `state_dict` gave into an agent of the same settings and its callback (or None)."""
     agent.set_parameters(state["parameters"])
-    agent.num_timesteps = state["steps"]
+    agent.num_timesteps = int(state["steps"])
     if (normalising := agent.get_vec_normalize_env()) is not None:
         for name, moments in _moments(normalising).items():
             known = state[name]
             moments.mean, moments.var = known["mean"].numpy(), known["var"].numpy()
             moments.count = known["count"]
-    if "replay" in state:
-        replay, seen = agent.replay_buffer, state["replay"]
+    if (replay := getattr(agent, "replay_buffer", None)) is not None:
+        seen = state["replay"]
         for name in REPLAY:
             getattr(replay, name)[: len(seen[name])] = seen[name].numpy()
-        replay.pos, replay.full = seen["pos"], seen["full"]
+        replay.pos, replay.full = range(replay.buffer_size)[seen["pos"]], bool(seen["full"])
         agent.log_ent_coef.data.copy_(state["log_ent_coef"])
     if "recall" in state:
         recall.load_state_dict(state["recall"])
@@ -325,6 +337,7 @@ def main() -> int:
     def work() -> None:
         nonlocal folder
         cfg = from_command_line(sys.argv[1:])
+        needed()  # before there is a folder
         folder = cfg.resume or record.new_run(cfg.out, cfg.env, cfg.seed, asdict(cfg))
         say(f"run folder: {folder}")
         found = train(cfg, folder)

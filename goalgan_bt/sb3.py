@@ -84,6 +84,7 @@ class RecallTraces(BaseCallback):
 
     Raises:
         ValueError: for settings that make no sense.
+        ValueError: when learning begins, if what is remembered is of another task's sizes.
         TypeError: when learning begins, if the agent's policy is no Gaussian (without memory or
             state-dependent exploration), or its observations or actions are not vectors.
     """
@@ -100,6 +101,7 @@ class RecallTraces(BaseCallback):
         self._remembered, self._turned = 0, 0
         self._moments: dict[str, Any] | None = None  # of a saved optimiser
         self._agent: Any = None  # whose policy the optimiser is for
+        self._now: FloatArray = np.empty(0)  # observations before the next step
         self.last: dict[str, float] = {}
         self.seconds = 0.0
 
@@ -127,8 +129,17 @@ class RecallTraces(BaseCallback):
         self._squashed = isinstance(policy, SACPolicy)
         self._learner = policy.actor if self._squashed else policy
         self._low, self._high = actions.low.astype(float), actions.high.astype(float)
+        sizes = space.shape[0], actions.shape[0]
+        if self.trajectories:
+            first = self.trajectories[0]
+            known_sizes = first.obs.shape[1], first.actions.shape[1]
+            if known_sizes != sizes:
+                raise ValueError(
+                    f"this RecallTraces remembers observations and actions of {known_sizes} "
+                    f"numbers, the agent's have {sizes}: take a new one"
+                )
         if self.dynamics is None:
-            self.dynamics = self._new_model(space.shape[0], actions.shape[0])
+            self.dynamics = self._new_model(*sizes)
         if self._agent is not self.model:
             self._agent, self._turned = self.model, self.model.num_timesteps
             self._optimiser = torch.optim.Adam(self._learner.parameters(), self.cfg.learning_rate)
@@ -138,12 +149,14 @@ class RecallTraces(BaseCallback):
             self._moments = None
 
     def _on_training_start(self) -> None:
-        if self.locals["reset_num_timesteps"]:  # then the environments have been reset, too
+        self._normalising = self.model.get_vec_normalize_env()
+        begin, anew = self._original(self.model._last_obs), self.locals["reset_num_timesteps"]
+        if anew:
             self._turned = 0
+        if anew or not np.array_equal(begin, self._now):  # the environments have been reset
             for path in self._paths:
                 path.clear()
-        self._normalising = self.model.get_vec_normalize_env()
-        self._now = self._original(self.model._last_obs)
+        self._now = begin
 
     def _original(self, obs: Any) -> FloatArray:
         """The last observations as the environments gave them: what an agent that normalises has
@@ -203,12 +216,13 @@ class RecallTraces(BaseCallback):
         return faded(self.cfg.max_kl, self.num_timesteps, self.cfg.fade_steps)
 
     def best(self) -> tuple[list[Trajectory], float]:
-        """The trajectories whose return is in the top percent, and the lowest of those returns."""
+        """The trajectories whose return is in the top percent, and the lowest of those returns. The
+        lowest of all is never among them: where few reach a goal, it is what all others get."""
         returns = np.array([trajectory.rewards.sum() for trajectory in self.trajectories])
         if not len(returns) or returns.min() == returns.max():
             return [], np.nan  # none is better than another
         most = max(1, round(len(returns) * self.cfg.top_percent / 100))
-        threshold = np.sort(returns)[-most]
+        threshold = max(np.sort(returns)[-most], returns[returns > returns.min()].min())
         chosen = zip(self.trajectories, returns, strict=True)
         return [one for one, total in chosen if total >= threshold], float(threshold)
 
@@ -392,10 +406,10 @@ class RecallTraces(BaseCallback):
         """Settings, model and trajectories, to go on with a saved agent.
 
         Raises:
-            ValueError: if nothing was learned yet.
+            ValueError: if no episode has ended yet.
         """
         if self.dynamics is None or not self.trajectories:
-            raise ValueError("nothing was learned yet: save after `learn`")
+            raise ValueError("nothing was learned yet: save after the first episode of `learn`")
         moments = self._optimiser.state_dict() if self._agent is not None else self._moments
         return {
             "cfg": asdict(self.cfg),
@@ -424,7 +438,7 @@ class RecallTraces(BaseCallback):
         """Write the `state_dict`, to go on with a saved agent (`load`).
 
         Raises:
-            ValueError: if nothing was learned yet.
+            ValueError: if no episode has ended yet.
         """
         torch.save(self.state_dict(), path)
 
@@ -438,8 +452,19 @@ class RecallTraces(BaseCallback):
             path: of the file.
             cfg: settings; those that were saved if None.
             seed: as of a new one.
+
+        Raises:
+            OSError: if the file cannot be opened.
+            ValueError: if it is damaged, or made with another `RecallConfig.model`.
         """
-        state = torch.load(path, weights_only=True)
-        callback = cls(cfg or RecallConfig(**state["cfg"]), seed)
-        callback.load_state_dict(state)
+        try:
+            state = torch.load(path, weights_only=True)
+            callback = cls(cfg or RecallConfig(**state["cfg"]), seed)
+            if (kind := state["cfg"]["model"]) != callback.cfg.model:
+                raise ValueError(f"its model is {kind}, not {callback.cfg.model}")
+            callback.load_state_dict(state)
+        except OSError:
+            raise
+        except Exception as error:  # torch raises many kinds for a damaged file
+            raise ValueError(f"cannot load {path}: {error}") from error
         return callback

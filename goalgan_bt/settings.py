@@ -4,6 +4,7 @@ They stand here together, apart from what reads them, so that the command line a
 importing the learner takes seconds.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -244,11 +245,13 @@ class RecallConfig:
     def problem(self) -> str | None:
         """What is wrong with these settings, if anything is."""
         counts = "trace_length traces capacity min_steps every imitation_steps imitation_batch"
+        for name in (*counts.split(), "model_steps"):
+            if type(value := getattr(self, name)) is not int:
+                return f"{name} must be a whole number, not {value!r}"
         for name in (*counts.split(), "learning_rate", "max_kl", "top_percent"):
-            if not getattr(self, name) > 0:
-                return f"{name} must be greater than 0, not {getattr(self, name)}"
-            if name in counts.split() and not isinstance(getattr(self, name), int):
-                return f"{name} must be a whole number, not {getattr(self, name)}"
+            value = getattr(self, name)
+            if not isinstance(value, (int, float)) or not 0 < value < math.inf:
+                return f"{name} must be greater than 0, not {value!r}"
         fade = self.fade_steps
         if fade is not None and (type(fade) is not int or fade < 1):
             return f"fade_steps must be a whole number from 1 on, or None, not {fade!r}"

@@ -17,6 +17,7 @@ if __name__ == "__main__":  # while it imports, nothing has begun
 
 import csv
 import fcntl
+import functools
 import json
 import math
 import re
@@ -175,6 +176,11 @@ def settings(run: Run) -> Any:
     Raises:
         UsageError: for bad ones.
     """
+    return replace(_settings(run._replace(seed=0)), seed=run.seed)
+
+
+@functools.cache  # `load` has asked for all: threads, in which tyro is not safe, only look them up
+def _settings(run: Run) -> Any:
     asked = words(run)
     return (config.other_learner(asked) or config).from_command_line(asked)
 

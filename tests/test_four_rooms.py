@@ -198,6 +198,15 @@ def test_a_run_from_its_flags_to_its_figures(tmp_path):
         assert refused.returncode == 2 and refused.stderr.count("\n") == 1
     picture = run_module("plot", folder, "--out", tmp_path.parent / f"{tmp_path.name}.png")
     assert picture.returncode == 0, picture.stderr
+    text = (folder / "metrics.csv").read_text()
+    for broken, said in (
+        (text.splitlines()[0] + "\n", "holds no report yet"),
+        (text.replace(f"{rows[0]['eval/coverage']},{rows[0]['eval/return']},", "abc,1,", 1), "abc"),
+    ):
+        (folder / "metrics.csv").write_text(broken)
+        refused = run_module("plot", folder)
+        assert refused.returncode == 2 and said in refused.stderr
+        assert str(folder) in refused.stderr and refused.stderr.count("\n") == 1
     again = train("--out", tmp_path / "again", "--seed", 3)
     assert again.returncode == 0
     (other,) = (tmp_path / "again").iterdir()
@@ -238,7 +247,7 @@ def test_larger_rooms_need_recall_traces(tmp_path):
     means = {}
     for method in ("actor_critic", "recall_traces"):
         runs = [replace(cfg, method=method, seed=seed) for seed in range(4)]
-        means[method] = np.mean([four_rooms.train(run, tmp_path).success for run in runs])
+        means[method] = np.mean([four_rooms.train(run, tmp_path)[0].success for run in runs])
     assert means["recall_traces"] > means["actor_critic"] + 0.5
 
 

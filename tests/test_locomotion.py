@@ -157,6 +157,36 @@ def test_damaged_settings_are_refused(change, tmp_path):
         locomotion.load(tmp_path)
 
 
+@pytest.mark.parametrize(
+    "change", [{"done": ("a", 1, 2, 3)}, {"steps": "many"}, {"replay": None}, {"replay": "past"}]
+)
+def test_a_checkpoint_that_says_nonsense_is_refused(change, tmp_path):
+    pytest.importorskip("sb3_contrib")
+    cfg = locomotion.preset("hopper", "sac")
+    agent, _ = locomotion.make(cfg)
+    agent.learn(10)
+    state = {"done": (1, 5, 1.0, 2.0)} | locomotion.state_dict(agent, None)
+    if change == {"replay": "past"}:
+        change = {"replay": state["replay"] | {"pos": 10**7}}
+    for told, good in ((state, True), (state | change, False)):
+        checkpoint.save(told, tmp_path / "checkpoint.pt")
+        if good:
+            assert locomotion.resume(agent, None, tmp_path) == (1, 5, 1.0, 2.0)
+        else:
+            with pytest.raises(record.RunError, match="it is damaged"):
+                locomotion.resume(agent, None, tmp_path)
+
+
+@pytest.mark.parametrize("package", ["stable_baselines3", "sb3_contrib"])
+def test_without_the_agents_there_is_no_run_folder(package, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, package, None)
+    flags = "--env", "hopper", "--out", str(tmp_path / "runs")
+    monkeypatch.setattr(sys, "argv", ["train", *flags])
+    assert locomotion.main() == 2 and not (tmp_path / "runs").exists()
+    said = capsys.readouterr().err
+    assert said == f'error: locomotion needs {package}: pip install "goalgan_bt[sb3]"\n'
+
+
 def test_without_traces_nothing_is_recalled(tmp_path):
     pytest.importorskip("sb3_contrib")
     flags = "--env", "hopper", "--total-steps", 4000, "--out", tmp_path

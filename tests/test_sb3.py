@@ -118,6 +118,11 @@ def test_the_threshold_is_a_percentile_and_the_memory_has_an_end():
     assert sum(len(one.rewards) for one in callback.trajectories) == 100
     chosen, threshold = callback.best()
     assert threshold == 5 * 8 and len(chosen) == 4  # of 20 trajectories those of 8 and 9 a step
+    callback = recall(top_percent=20)
+    for i in range(100):  # sparse reward: one in twenty gets there
+        callback._remember([(np.zeros(2), np.zeros(2), float(i % 20 == 0))], np.zeros(2), True)
+    chosen, threshold = callback.best()
+    assert threshold == 1 and len(chosen) == 5
     callback.trajectories.clear()
     same = Trajectory(np.zeros((2, 2)), np.zeros((1, 2)), np.ones(1), True)
     callback.trajectories.extend([same, same])
@@ -165,6 +170,23 @@ def test_agents_that_are_not_gaussian_are_refused():
         RecallTraces().save("nowhere")
 
 
+def test_what_was_saved_for_another_task_is_refused(tmp_path):
+    callback = recall()
+    agent("PPO", make_vec_env(Reach, seed=0)).learn(300, callback=callback)
+    callback.save(tmp_path / "recall.pt")
+    with pytest.raises(ValueError, match=r"numbers, the agent's have \(3, 1\)"):
+        PPO("MlpPolicy", "Pendulum-v1").learn(
+            10, callback=RecallTraces.load(tmp_path / "recall.pt")
+        )
+    with pytest.raises(ValueError, match="its model is backward, not forward"):
+        RecallTraces.load(tmp_path / "recall.pt", RecallConfig(model="forward"))
+    (tmp_path / "recall.pt").write_bytes((tmp_path / "recall.pt").read_bytes()[:500])
+    with pytest.raises(ValueError, match=r"cannot load .*recall\.pt"):
+        RecallTraces.load(tmp_path / "recall.pt")
+    with pytest.raises(FileNotFoundError):
+        RecallTraces.load(tmp_path / "nowhere.pt")
+
+
 def test_learning_goes_on_where_it_was_or_anew():
     """A second call of `learn` keeps the unfinished episodes; one that begins anew drops them."""
     env = make_vec_env(Reach, n_envs=2, seed=0)
@@ -178,6 +200,11 @@ def test_learning_goes_on_where_it_was_or_anew():
     model.learn(80, callback=callback)
     assert {len(one.rewards) for one in callback.trajectories} == {30}
     assert len(callback.trajectories) == before + 2
+    model.set_env(make_vec_env(Reach, n_envs=2, seed=1))  # whose episodes begin as they do
+    model.learn(160, callback=callback, reset_num_timesteps=False)
+    for one in callback.trajectories:
+        moved = np.clip(one.obs[:-1] + one.actions * FASTEST, -2, 2)
+        np.testing.assert_allclose(moved, one.obs[1:], atol=1e-5)
 
 
 def test_the_bound_fades_and_then_nothing_is_recalled():
@@ -315,6 +342,9 @@ def test_traces_begin_where_it_pays_to_be(monkeypatch):
         {"model": "forwards"},
         {"seeds": "values"},
         {"trace_length": 2.5},
+        {"trace_length": "20"},
+        {"model_steps": None},
+        {"learning_rate": np.inf},
         {"fade_steps": 0},
         {"fade_steps": 2.5},
     ],

@@ -8,13 +8,14 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 from conftest import run_module
 
-from goalgan_bt import checkpoint, locomotion, record, study
+from goalgan_bt import checkpoint, config, locomotion, record, study
 from goalgan_bt.command_line import UsageError
 
 evidence = pytest.importorskip("goalgan_bt.evidence")
@@ -253,6 +254,23 @@ def test_an_interrupted_study_ends_its_trainings(tmp_path, number, code):
     assert len(list(tmp_path.glob("runs/**/metrics.csv"))) == 2  # no run was begun twice
     for metrics in begun:
         assert metrics.read_text().splitlines()[-1].startswith("12,")
+
+
+def test_settings_are_known_to_every_thread():
+    """Two command lines parsed at a time spoil each other, and where standard output goes."""
+    runs = study.grid(study.load("locomotion_lengths")) + study.grid(study.load("ablations"))
+    output, interval = sys.stdout, sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            found = list(pool.map(study.settings, runs))
+    finally:
+        sys.setswitchinterval(interval)
+        spoilt, sys.stdout = sys.stdout is not output, output
+    assert not spoilt
+    for run, cfg in list(zip(runs, found, strict=True))[::7]:
+        words = study.words(run)
+        assert cfg == (config.other_learner(words) or config).from_command_line(words)
 
 
 def test_locomotion_that_was_cut_off_goes_on(tmp_path):

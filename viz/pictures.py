@@ -39,9 +39,14 @@ def curve(ax: Axes, folders: list[Path], until: int | None = None) -> None:
     references: dict[Published, None] = {}  # in the order given
     for i, (folder, (_, rows)) in enumerate(zip(folders, tables, strict=True)):
         rows = [row for row in rows if row.get(f"eval/{measure}")]
+        if not rows and maze_of(folder) is None:
+            raise record.RunError(f"{folder} holds no report yet: there is nothing to draw")
         known = sum(until is None or int(row["iteration"]) <= until for row in rows)
-        steps = [float(row.get("steps/train") or "nan") for row in rows]
-        values = [float(row[f"eval/{measure}"]) for row in rows]
+        try:
+            steps = [float(row.get("steps/train") or "nan") for row in rows]
+            values = [float(row[f"eval/{measure}"]) for row in rows]
+        except ValueError as error:
+            raise record.RunError(f"{folder / 'metrics.csv'} is damaged: {error}") from None
         values[known:] = [math.nan] * (len(rows) - known)
         run = Run(folder)
         ax.update_datalim([(x, 0.0) for x in steps], updatey=False)
@@ -131,6 +136,8 @@ def overview(folders: list[Path], maps: int = 4, at: tuple[int, ...] = ()) -> Fi
     """
     maps = len(at) or maps
     with_maze = [folder for folder in folders if maze_of(folder) is not None]
+    if at and not with_maze:
+        raise record.RunError("--at chooses maps, and these runs have no maze to draw")
     rows = len(with_maze)
     figure = Figure(figsize=(2.4 * maps, 2.6 * rows + 3.2), layout="constrained")
     grid = figure.add_gridspec(rows + 1, maps, height_ratios=[2.6] * rows + [3.2])
