@@ -4,7 +4,8 @@
     python benchmarks/visits.py runs/studies/four_rooms docs/studies/four_rooms
 
 writes visits.png, mean counts over seeds, and visits.csv: in how many of the free cells the trained
-policy was in its last fifty episodes, and how many were visited in training.
+policy was in its last fifty episodes, and how many were visited in training: those that a
+step began in, so never the goal.
 """
 
 import csv

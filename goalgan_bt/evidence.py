@@ -164,7 +164,7 @@ def report(study: Study, tables: Tables) -> None:
     """Write README.md, summary.csv and curves.png beside the tables of a study."""
     runs = curves(tables)
     rows: list[dict[str, str]] = []
-    text = [f"# Study {study.name}", "", f"From `python -m goalgan_bt.study {study.name}`."]
+    text = [f"# Study {study.name}", "", f"From `python -m goalgan_bt.study {study.called}`."]
     envs = [env for env in study.envs if any((env, method) in runs for method in study.methods)]
     if not envs:
         raise UsageError(f"{tables.folder} holds no run of this study's methods")

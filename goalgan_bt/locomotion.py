@@ -278,10 +278,12 @@ def resume(agent: Any, recall: Any, folder: Path) -> tuple[int, int, float, floa
         Measurements so far, their steps, seconds of the run, and the last return.
 
     Raises:
-        RunError: if there is no checkpoint, or it cannot be used.
+        RunError: if the run is finished, or there is no checkpoint, or it cannot be used.
     """
     from goalgan_bt import checkpoint
 
+    if (folder / "policy.pt").exists() and not (folder / "checkpoint.pt").exists():
+        raise record.RunError(f"{folder} is finished: there is nothing left to do")
     with checkpoint.saved(folder) as state:
         restore(agent, recall, state)
         reports, tested, seconds, mean = state["done"]

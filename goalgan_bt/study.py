@@ -47,8 +47,8 @@ TRAININGS: list["subprocess.Popen[str]"] = []  # what this process runs at prese
 
 class Study(NamedTuple):
     """name: of the file; envs, methods (name -> flags), seeds: the grid; flags: of all; measure:
-    what is compared, "coverage" or (locomotion) "return". An environment may have flags of its own
-    behind its name."""
+    what is compared, "coverage" or (locomotion) "return"; called: the command's argument. An
+    environment may have flags of its own behind its name."""
 
     name: str
     envs: list[str]
@@ -56,6 +56,7 @@ class Study(NamedTuple):
     seeds: range
     flags: str
     measure: str
+    called: str
 
 
 class Run(NamedTuple):
@@ -135,7 +136,8 @@ def load(name: str) -> Study:
         raise UsageError(f"{wrong}{error}") from None
     if len(measures) > 1:
         raise UsageError(f"{wrong}some of its environments have a coverage, others a return")
-    study = Study(path.stem, table["envs"], table["methods"], seeds, flags, measures.pop())
+    of_all = flags, measures.pop(), Path(name).name
+    study = Study(path.stem, table["envs"], table["methods"], seeds, *of_all)
     for run in grid(study._replace(seeds=seeds[:1])):
         try:
             given = {word.split("=")[0] for word in shlex.split(f"{run.env} {run.flags}")}

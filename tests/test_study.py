@@ -112,6 +112,7 @@ def test_a_study_from_its_file_to_its_report(finished):
         assert len(steps) >= 2 and steps == sorted(steps)
     report = (out / "README.md").read_text()
     assert "| goal_gan | 2 |" in report and "recall_traces over goal_gan" in report
+    assert "From `python -m goalgan_bt.study tiny.toml`." in report  # without where it lay
     assert (out / "curves.png").stat().st_size > 10_000
     with (out / "summary.csv").open() as file:
         assert [row["method"] for row in csv.DictReader(file)] == ["recall_traces", "goal_gan"]
