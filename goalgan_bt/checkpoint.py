@@ -69,9 +69,13 @@ def saved(folder: Path) -> Iterator[dict[str, Any]]:
     try:
         yield torch.load(path, weights_only=True)
     except Exception as error:  # torch raises many kinds for a damaged file
-        words = str(error).strip().splitlines() or [type(error).__name__]
-        reason = words[0].split(". ")[0][:160]
         raise RunError(
             f"cannot resume from {path}: it is damaged or of other settings or another version "
-            f"({reason})"
+            f"({reason(error)})"
         ) from None
+
+
+def reason(error: Exception) -> str:
+    """What went wrong with a file, in a few words: torch's errors have pages."""
+    words = (str(error).strip().splitlines() or [""])[0].split(". ")[0][:160]
+    return words if len(words.split()) > 1 else f"{type(error).__name__} {words}".strip()

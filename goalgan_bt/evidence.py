@@ -19,7 +19,7 @@ from scipy import stats
 from goalgan_bt import record
 from goalgan_bt.command_line import UsageError
 from goalgan_bt.envs.maze import FloatArray
-from goalgan_bt.study import Run, Study, Tables, settings
+from goalgan_bt.study import Run, Study, Tables, grid, settings
 from goalgan_bt.viz.published import published
 
 THRESHOLDS = (0.3, 0.48, 0.63, 0.9)  # coverage; 0.48 and 0.63 are Goyal et al. 2019's
@@ -165,6 +165,10 @@ def report(study: Study, tables: Tables) -> None:
     runs = curves(tables)
     rows: list[dict[str, str]] = []
     text = [f"# Study {study.name}", "", f"From `python -m goalgan_bt.study {study.called}`."]
+    asked = {run.key for run in grid(study)}
+    there = sum((row["env"], row["method"], row["seed"]) in asked for row in tables.costs)
+    if there < len(asked):
+        text += ["", f"**Not finished: {there} of {len(asked)} runs are in.**"]
     envs = [env for env in study.envs if any((env, method) in runs for method in study.methods)]
     if not envs:
         raise UsageError(f"{tables.folder} holds no run of this study's methods")
@@ -194,16 +198,16 @@ def report(study: Study, tables: Tables) -> None:
 
 
 def _commits(costs: list[dict[str, str]]) -> str:
-    """The commit of most runs, and which methods were run with others."""
-    methods: dict[str, list[str]] = {}
+    """The commit of most runs, and which runs were made with others."""
+    made: dict[str, list[str]] = {}
     for row in costs:
         of = row["commit"].split("+")  # more than one where a run was resumed with other code
         short = (one[:12] + "-dirty" * one.endswith("-dirty") for one in of)
-        methods.setdefault("+".join(short) or "unknown", []).append(row["method"])
-    most, *others = sorted(methods, key=lambda commit: -len(methods[commit]))
+        made.setdefault("+".join(short) or "unknown", []).append(f"{row['method']} of {row['env']}")
+    most, *others = sorted(made, key=lambda commit: -len(made[commit]))
     text = f"Commit: {most}"
     for commit in others:
-        some = methods[commit]
+        some = made[commit]
         text += f"; {commit} for {len(some)} of the runs of {', '.join(dict.fromkeys(some))}"
     return f"{text}."
 

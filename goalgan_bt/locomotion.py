@@ -6,6 +6,7 @@ gymnasium's tasks and the agents of sb3-contrib and Stable-Baselines3, with the 
 `goalgan_bt.sb3`; a trace length of 0 is the agent alone.
 """
 
+import math
 import sys
 import time
 from dataclasses import asdict, dataclass, field, replace
@@ -288,6 +289,8 @@ def resume(agent: Any, recall: Any, folder: Path) -> tuple[int, int, float, floa
         restore(agent, recall, state)
         reports, tested, seconds, mean = state["done"]
         done = int(reports), int(tested), float(seconds), float(mean)
+        if not math.isfinite(sum(done)):
+            raise ValueError("what was measured is not finite")
     return done
 
 
@@ -312,6 +315,8 @@ def state_dict(agent: Any, recall: Any) -> dict[str, Any]:
 def restore(agent: Any, recall: Any, state: dict[str, Any]) -> None:
     """Put what `state_dict` gave into an agent of the same settings and its callback (or None)."""
     agent.set_parameters(state["parameters"])
+    if not all(weights.isfinite().all() for weights in agent.policy.parameters()):
+        raise ValueError("a weight is not finite")
     agent.num_timesteps = int(state["steps"])
     if (normalising := agent.get_vec_normalize_env()) is not None:
         for name, moments in _moments(normalising).items():
@@ -324,6 +329,8 @@ def restore(agent: Any, recall: Any, state: dict[str, Any]) -> None:
             getattr(replay, name)[: len(seen[name])] = seen[name].numpy()
         replay.pos, replay.full = range(replay.buffer_size)[seen["pos"]], bool(seen["full"])
         agent.log_ent_coef.data.copy_(state["log_ent_coef"])
+        if not agent.log_ent_coef.isfinite().all():
+            raise ValueError("the temperature is not finite")
     if "recall" in state:
         recall.load_state_dict(state["recall"])
 

@@ -32,6 +32,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from goalgan_bt.envs.maze import Maze
+from goalgan_bt.progress import complain
 
 T = TypeVar("T")
 
@@ -165,8 +166,9 @@ def _build(kind: type[T], values: Any) -> T:
 def _convert(hint: Any, value: Any) -> Any:
     if is_dataclass(hint):
         return _build(typing.cast(type[Any], hint), value)
-    if hint in (bool, int, float, str) and not isinstance(
-        value, (hint, int) if hint is float else hint
+    if hint in (bool, int, float, str) and (
+        not isinstance(value, (hint, int) if hint is float else hint)
+        or isinstance(value, bool) != (hint is bool)
     ):
         raise TypeError(f"expected {hint.__name__}, found {value!r}")
     if value is not None and (
@@ -214,6 +216,11 @@ class Record:
             self._columns, rows = read_metrics(folder)
             self._rows = [row for row in rows if int(row["iteration"]) <= iteration]
             self._rewrite()
+        if iteration and not (self._rows and int(self._rows[-1]["iteration"]) == iteration):
+            complain(
+                f"{folder / 'metrics.csv'} has no row of iteration {iteration}, whose checkpoint "
+                "it goes on from: the curves will have a gap"
+            )
         for frame in frames(folder):
             if int(frame.stem) > iteration:
                 frame.unlink()
@@ -295,7 +302,7 @@ def read_metrics(folder: Path) -> tuple[list[str], list[dict[str, str]]]:
     """Columns and rows of a run's `metrics.csv`, as text; a last row cut short is left out.
 
     Raises:
-        RunError: if the folder has none.
+        RunError: if the folder has none, or it is damaged.
     """
     try:
         with (folder / "metrics.csv").open(newline="") as file:
@@ -313,8 +320,12 @@ def read_metrics(folder: Path) -> tuple[list[str], list[dict[str, str]]]:
         raise RunError(f"cannot read {folder / 'metrics.csv'}: {error}") from None
     except (csv.Error, UnicodeDecodeError) as error:
         raise RunError(f"{folder / 'metrics.csv'} is damaged: {error}") from None
-    if columns and not all(row.get("iteration", "").isdigit() for row in rows):
-        raise RunError(f"{folder / 'metrics.csv'} is damaged: a row has no iteration")
+    counts = [row.get(name, "") for row in rows for name in ("iteration", "steps/train")]
+    if any(None in row for row in rows) or not all(count.isdecimal() for count in counts):
+        raise RunError(
+            f"{folder / 'metrics.csv'} is damaged: each row needs an iteration, steps/train and a "
+            "cell per column"
+        )
     return columns, rows
 
 
@@ -332,6 +343,11 @@ def read_meta(folder: Path) -> dict[str, Any]:
         raise RunError(f"cannot read {folder / 'meta.json'}: {error}") from None
     if not isinstance(meta, dict) or "commit" not in meta:
         raise RunError(f"{folder / 'meta.json'} is damaged: it names no commit")
+    resumed = meta.get("resumed", [])
+    if not isinstance(resumed, list) or not all(
+        isinstance(call, dict) and "commit" in call for call in resumed
+    ):
+        raise RunError(f"{folder / 'meta.json'} is damaged: what it was resumed with")
     return meta
 
 

@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.distributions import Normal, kl_divergence
 
 from goalgan_bt.backtracking import BacktrackingModel, Transitions, recall_traces
-from goalgan_bt.checkpoint import restore
+from goalgan_bt.checkpoint import reason, restore
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.forward import ForwardModel
 from goalgan_bt.imitation import faded
@@ -80,7 +80,8 @@ class RecallTraces(BaseCallback):
     Attributes:
         trajectories: what is remembered, the newest last; dynamics: the backtracking model (or the
             forward one, see `RecallConfig.model`), once learning has begun; last: what the last
-            turn gave (see `turn`); seconds: what all turns took.
+            turn gave (see `turn`); seconds: what all of it took, the turns and what is remembered
+            at each step.
 
     Raises:
         ValueError: for settings that make no sense.
@@ -101,11 +102,13 @@ class RecallTraces(BaseCallback):
         self._remembered, self._turned = 0, 0
         self._moments: dict[str, Any] | None = None  # of a saved optimiser
         self._agent: Any = None  # whose policy the optimiser is for
+        self._sizes = (0, 0)  # of observations and actions of the model
         self._now: FloatArray = np.empty(0)  # observations before the next step
         self.last: dict[str, float] = {}
         self.seconds = 0.0
 
     def _new_model(self, obs_dim: int, act_dim: int) -> BacktrackingModel | ForwardModel:
+        self._sizes = obs_dim, act_dim
         cfg = BacktrackingConfig(batch=256, steps=self.cfg.model_steps)
         with torch.random.fork_rng(devices=[]):  # the agent's own noise stays as it would be alone
             torch.manual_seed(self._seed)
@@ -130,23 +133,20 @@ class RecallTraces(BaseCallback):
         self._learner = policy.actor if self._squashed else policy
         self._low, self._high = actions.low.astype(float), actions.high.astype(float)
         sizes = space.shape[0], actions.shape[0]
-        if self.trajectories:
-            first = self.trajectories[0]
-            known_sizes = first.obs.shape[1], first.actions.shape[1]
-            if known_sizes != sizes:
-                raise ValueError(
-                    f"this RecallTraces remembers observations and actions of {known_sizes} "
-                    f"numbers, the agent's have {sizes}: take a new one"
-                )
-        if self.dynamics is None:
+        if self.dynamics is None or (sizes != self._sizes and not self.trajectories):
             self.dynamics = self._new_model(*sizes)
+        if sizes != self._sizes:
+            raise ValueError(
+                f"this RecallTraces remembers observations and actions of {self._sizes} numbers, "
+                f"the agent's have {sizes}: take a new one"
+            )
         if self._agent is not self.model:
             self._agent, self._turned = self.model, self.model.num_timesteps
             self._optimiser = torch.optim.Adam(self._learner.parameters(), self.cfg.learning_rate)
             self._paths: list[list[tuple[Any, Any, float]]] = [[] for _ in range(self.model.n_envs)]
-        if self._moments is not None:
+        if self._moments is not None and _fit(self._moments, self._optimiser):
             restore(self._optimiser, self._moments)
-            self._moments = None
+        self._moments = None
 
     def _on_training_start(self) -> None:
         self._normalising = self.model.get_vec_normalize_env()
@@ -171,6 +171,7 @@ class RecallTraces(BaseCallback):
         return np.asarray(self._normalising.normalize_obs(obs))
 
     def _on_step(self) -> bool:
+        begin = time.perf_counter()
         given = self.locals
         actions = given.get("clipped_actions", given["actions"])
         told = self._told(actions)
@@ -187,6 +188,7 @@ class RecallTraces(BaseCallback):
                 self._remember(path, last, not timeout)
                 path.clear()
         self._now = self._original(given["new_obs"])
+        self.seconds += time.perf_counter() - begin
         return True
 
     def _remember(
@@ -423,13 +425,23 @@ class RecallTraces(BaseCallback):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` gave, but for the settings; before `learn`."""
+        """Take over what `state_dict` gave, but for the settings; before `learn`. The optimiser of
+        the imitation begins anew where the agent is another than it was.
+
+        Raises:
+            ValueError: if there is no trajectory, or one that is none.
+        """
+        sizes = set()
         for obs, actions, rewards, terminated in state["trajectories"]:
             one = Trajectory(obs.numpy(), actions.numpy(), rewards.numpy(), terminated)
+            sizes.add((one.obs.shape[1], one.actions.shape[1]))
+            if not len(one.obs) - 1 == len(one.actions) == len(one.rewards):
+                raise ValueError("a trajectory's parts differ in length")
             self.trajectories.append(one)
             self._remembered += len(one.rewards)
-        first = self.trajectories[0]
-        self.dynamics = self._new_model(first.obs.shape[1], first.actions.shape[1])
+        if len(sizes) != 1:
+            raise ValueError(f"it must hold trajectories of one task, not of {len(sizes)}")
+        self.dynamics = self._new_model(*sizes.pop())
         self.dynamics.load_state_dict(state["model"])
         restore(self.dynamics.optimiser, state["model_optimiser"])
         self._moments = state["optimiser"]
@@ -466,5 +478,16 @@ class RecallTraces(BaseCallback):
         except OSError:
             raise
         except Exception as error:  # torch raises many kinds for a damaged file
-            raise ValueError(f"cannot load {path}: {error}") from error
+            why = f"it is damaged or of other settings ({reason(error)})"
+            raise ValueError(f"cannot load {path}: {why}") from error
         return callback
+
+
+def _fit(moments: dict[str, Any], optimiser: torch.optim.Optimizer) -> bool:
+    """Whether an optimiser's saved state is of parameters as those that it has now."""
+    (group,) = optimiser.param_groups
+    shapes = [param.shape for param in group["params"]]
+    known = moments.get("state", {})
+    return len(moments.get("param_groups", [{}])[0].get("params", [])) == len(shapes) and all(
+        known[i]["exp_avg"].shape == shapes[i] for i in known
+    )

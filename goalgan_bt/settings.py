@@ -6,6 +6,7 @@ importing the learner takes seconds.
 
 import math
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Literal
 
 
@@ -246,14 +247,16 @@ class RecallConfig:
         """What is wrong with these settings, if anything is."""
         counts = "trace_length traces capacity min_steps every imitation_steps imitation_batch"
         for name in (*counts.split(), "model_steps"):
-            if type(value := getattr(self, name)) is not int:
+            value = getattr(self, name)
+            if not isinstance(value, Integral) or isinstance(value, bool):
                 return f"{name} must be a whole number, not {value!r}"
         for name in (*counts.split(), "learning_rate", "max_kl", "top_percent"):
             value = getattr(self, name)
-            if not isinstance(value, (int, float)) or not 0 < value < math.inf:
-                return f"{name} must be greater than 0, not {value!r}"
+            number = isinstance(value, Real) and not isinstance(value, bool)
+            if not number or not 0 < value < math.inf:
+                return f"{name} must be finite and greater than 0, not {value!r}"
         fade = self.fade_steps
-        if fade is not None and (type(fade) is not int or fade < 1):
+        if fade is not None and (type(fade) is bool or not isinstance(fade, Integral) or fade < 1):
             return f"fade_steps must be a whole number from 1 on, or None, not {fade!r}"
         for name, choices in (("model", "backward forward"), ("seeds", "value reward")):
             if getattr(self, name) not in choices.split():

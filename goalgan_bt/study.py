@@ -138,12 +138,15 @@ def load(name: str) -> Study:
         raise UsageError(f"{wrong}some of its environments have a coverage, others a return")
     of_all = flags, measures.pop(), Path(name).name
     study = Study(path.stem, table["envs"], table["methods"], seeds, *of_all)
-    for run in grid(study._replace(seeds=seeds[:1])):
+    *_, last = grid(study)
+    for run in grid(study._replace(seeds=seeds[-1:])):
         try:
             given = {word.split("=")[0] for word in shlex.split(f"{run.env} {run.flags}")}
             if given := given & OURS:
                 raise UsageError(f"{given.pop()} is the study's own")
             settings(run)
+            if run == last:
+                _parsed(run)  # with its seed
         except ValueError as error:  # UsageError is one
             raise UsageError(f"{wrong}{run.env}, {run.method}: {error}") from None
     return study
@@ -181,10 +184,13 @@ def settings(run: Run) -> Any:
     return replace(_settings(run._replace(seed=0)), seed=run.seed)
 
 
-@functools.cache  # `load` has asked for all: threads, in which tyro is not safe, only look them up
-def _settings(run: Run) -> Any:
+def _parsed(run: Run) -> Any:
     asked = words(run)
     return (config.other_learner(asked) or config).from_command_line(asked)
+
+
+# `load` has asked for all: threads, in which tyro is not safe, only look them up.
+_settings = functools.cache(_parsed)
 
 
 def perform(run: Run, folder: Path) -> Path:
@@ -341,8 +347,12 @@ def finished(
                 yield jobs[job], job
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
-            for training in list(TRAININGS):  # where this was interrupted: each saves what it can
-                training.terminate()
+            ended: list[Any] = []
+            while not all(job.done() for job in jobs):  # where this was interrupted
+                for training in [one for one in TRAININGS if one not in ended]:
+                    training.terminate()  # each saves what it can
+                    ended.append(training)
+                time.sleep(0.02)  # another may be about to begin
             pool.shutdown()
         return
     try:

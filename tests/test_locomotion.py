@@ -158,7 +158,16 @@ def test_damaged_settings_are_refused(change, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "change", [{"done": ("a", 1, 2, 3)}, {"steps": "many"}, {"replay": None}, {"replay": "past"}]
+    "change",
+    [
+        {"done": ("a", 1, 2, 3)},
+        {"done": (1, 5, np.nan, 2.0)},
+        {"log_ent_coef": torch.tensor([np.nan])},
+        {"parameters": "nan"},
+        {"steps": "many"},
+        {"replay": None},
+        {"replay": "past"},
+    ],
 )
 def test_a_checkpoint_that_says_nonsense_is_refused(change, tmp_path):
     pytest.importorskip("sb3_contrib")
@@ -168,6 +177,9 @@ def test_a_checkpoint_that_says_nonsense_is_refused(change, tmp_path):
     state = {"done": (1, 5, 1.0, 2.0)} | locomotion.state_dict(agent, None)
     if change == {"replay": "past"}:
         change = {"replay": state["replay"] | {"pos": 10**7}}
+    if change == {"parameters": "nan"}:
+        policy = {name: weights * np.nan for name, weights in state["parameters"]["policy"].items()}
+        change = {"parameters": state["parameters"] | {"policy": policy}}
     for told, good in ((state, True), (state | change, False)):
         checkpoint.save(told, tmp_path / "checkpoint.pt")
         if good:
@@ -200,7 +212,7 @@ def test_without_traces_nothing_is_recalled(tmp_path):
     ("flags", "words"),
     [
         (["--total-steps", "0"], "--total-steps must be"),
-        (["--backtracking.trace-length", "-1"], "trace_length must be greater"),
+        (["--backtracking.trace-length", "-1"], "trace_length must be finite and greater"),
         (["--method", "ppo"], "choose trpo or sac"),
         (["--speed", "9"], "--speed"),
     ],

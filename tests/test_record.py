@@ -1,4 +1,5 @@
 import csv
+import json
 import resource
 import subprocess
 from pathlib import Path
@@ -163,6 +164,45 @@ def test_a_run_that_is_taken_up_with_other_code_says_so(tmp_path, monkeypatch):
 def test_a_folder_that_is_no_run_says_so(tmp_path, read):
     with pytest.raises(RunError, match="is no run"):
         read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "iteration,steps/train\n1,5\n2,6,7\n",
+        "iteration,eval/return\n1,5\n",
+        "iteration,steps/train\n1,many\n",
+        "iteration,steps/train\n\u00b2,5\n",
+    ],
+)
+def test_a_damaged_table_says_so(tmp_path, text):
+    (tmp_path / "metrics.csv").write_text(text)
+    with pytest.raises(RunError, match=r"metrics\.csv is damaged"):
+        record.read_metrics(tmp_path)
+
+
+@pytest.mark.parametrize("resumed", [5, ["x"], [{}]])
+def test_damaged_meta_says_so(tmp_path, resumed):
+    (tmp_path / "meta.json").write_text(json.dumps({"commit": None, "resumed": resumed}))
+    with pytest.raises(RunError, match=r"meta\.json is damaged"):
+        record.read_meta(tmp_path)
+
+
+def test_a_lost_row_is_told(tmp_path, capsys):
+    record.write_meta(tmp_path, None)
+    records = Record(tmp_path)
+    for i in (1, 2, 3):
+        records.metrics(row(i))
+    records.close("stopped early")
+    Record(tmp_path, iteration=3).close("stopped early")
+    assert not capsys.readouterr().err
+    table = tmp_path / "metrics.csv"
+    table.write_text(table.read_text().rsplit(",", 1)[0])  # of the third row
+    Record(tmp_path, iteration=3).close("stopped early")
+    assert "has no row of iteration 3" in capsys.readouterr().err
+    table.unlink()
+    Record(tmp_path, iteration=3).close("stopped early")
+    assert "has no row of iteration 3" in capsys.readouterr().err
 
 
 def test_a_run_without_a_report_yet_says_so(tmp_path):

@@ -180,11 +180,55 @@ def test_what_was_saved_for_another_task_is_refused(tmp_path):
         )
     with pytest.raises(ValueError, match="its model is backward, not forward"):
         RecallTraces.load(tmp_path / "recall.pt", RecallConfig(model="forward"))
-    (tmp_path / "recall.pt").write_bytes((tmp_path / "recall.pt").read_bytes()[:500])
-    with pytest.raises(ValueError, match=r"cannot load .*recall\.pt"):
-        RecallTraces.load(tmp_path / "recall.pt")
     with pytest.raises(FileNotFoundError):
         RecallTraces.load(tmp_path / "nowhere.pt")
+
+
+def test_damaged_files_are_refused_in_one_line(tmp_path):
+    callback = recall()
+    agent("PPO", make_vec_env(Reach, seed=0)).learn(300, callback=callback)
+    callback.save(tmp_path / "good.pt")
+    RecallTraces.load(tmp_path / "good.pt")
+    state, path = torch.load(tmp_path / "good.pt", weights_only=True), tmp_path / "bad.pt"
+    obs, *others = state["trajectories"][0]
+    for bad, why in (
+        ((tmp_path / "good.pt").read_bytes()[:500], "PytorchStreamReader"),
+        (b"", "EOFError"),
+        (b"text", "pop from"),
+        ({"a": np.zeros(2)}, "Weights only load failed"),
+        ({"a": 1}, "KeyError 'cfg'"),
+        (state | {"trajectories": []}, "of one task"),
+        (state | {"trajectories": [[obs[1:], *others]]}, "differ in length"),
+    ):
+        if isinstance(bad, bytes):
+            path.write_bytes(bad)
+        else:
+            torch.save(bad, path)
+        with pytest.raises(ValueError, match=f"cannot load .*bad.pt: .*({why})") as told:
+            RecallTraces.load(path)
+        assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "more"), [("SAC", {}), ("PPO", {"policy_kwargs": {"net_arch": [32]}})]
+)
+def test_what_was_saved_goes_with_another_agent_of_the_task(name, more, tmp_path):
+    """The optimiser of the imitation begins anew: what it knows is of other weights."""
+    callback, env = recall(top_percent=50), make_vec_env(Reach, seed=0)
+    agent("PPO", env).learn(1200, callback=callback)
+    assert callback.last["kl"] > 0
+    callback.save(tmp_path / "recall.pt")
+    other = RecallTraces.load(tmp_path / "recall.pt")
+    agent(name, env, **more).learn(1200, callback=other)
+    assert other.last["kl"] > 0 and len(other.trajectories) > len(callback.trajectories)
+
+
+def test_before_an_episode_has_ended_any_task_will_do():
+    callback = recall()
+    agent("PPO", make_vec_env(Reach, seed=0), n_steps=4, batch_size=4).learn(4, callback=callback)
+    assert not callback.trajectories
+    PPO("MlpPolicy", "Pendulum-v1", n_steps=512, device="cpu").learn(1536, callback=callback)
+    assert callback.trajectories[0].obs.shape[1] == 3 and "state_nll" in callback.last
 
 
 def test_learning_goes_on_where_it_was_or_anew():
@@ -345,6 +389,7 @@ def test_traces_begin_where_it_pays_to_be(monkeypatch):
         {"trace_length": "20"},
         {"model_steps": None},
         {"learning_rate": np.inf},
+        {"top_percent": True},
         {"fade_steps": 0},
         {"fade_steps": 2.5},
     ],
@@ -352,3 +397,7 @@ def test_traces_begin_where_it_pays_to_be(monkeypatch):
 def test_settings_that_make_no_sense_are_refused(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         RecallTraces(RecallConfig(**bad))
+
+
+def test_numbers_of_numpy_are_numbers():
+    RecallTraces(RecallConfig(trace_length=np.int64(5), learning_rate=np.float32(1e-4)))

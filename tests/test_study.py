@@ -156,6 +156,7 @@ def test_a_study_of_returns(tmp_path):
     assert sorted({int(row["steps"]) for row in rows}) == [4096, 8192]
     report = (tmp_path / "run/README.md").read_text()
     assert "| recall_traces less trpo | 1 |" in report and "to 0.63" not in report
+    assert "Not finished" not in report
     # A finished run leaves no checkpoint, and is only read in all the same.
     made = sorted((tmp_path / "runs").glob("*/*/*/*/ended.txt"))
     for name in ("runs.csv", "costs.csv"):
@@ -163,6 +164,9 @@ def test_a_study_of_returns(tmp_path):
         (tmp_path / f"run/{name}").write_text(
             "".join(line for line in lines if ",trpo,0," not in line)
         )
+    part = run_module(*words, "--report")
+    assert part.returncode == 0, part.stderr
+    assert "**Not finished: 1 of 2 runs are in.**" in (tmp_path / "run/README.md").read_text()
     again = run_module(*words)
     assert again.returncode == 0 and "1 runs of 2 to go" in again.stdout
     assert len(made) == 2 == len(sorted((tmp_path / "runs").glob("*/*/*/*/ended.txt")))
@@ -257,6 +261,30 @@ def test_an_interrupted_study_ends_its_trainings(tmp_path, number, code):
         assert metrics.read_text().splitlines()[-1].startswith("12,")
 
 
+def test_a_training_that_is_just_being_started_ends_too(tmp_path, monkeypatch):
+    start = subprocess.Popen
+
+    def slowly(words, **more):
+        time.sleep(0.5)
+        return start(["sleep", "60"], **more)
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(subprocess, "Popen", slowly)
+    known = signal.signal(signal.SIGALRM, interrupt)
+    begin = time.monotonic()
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.2)
+        runs = [study.Run("hopper", "recall_traces", seed, "") for seed in range(3)]
+        cfg = study.StudyConfig("tiny", processes=2)
+        with pytest.raises(KeyboardInterrupt):
+            next(study.finished(cfg, runs, tmp_path))
+    finally:
+        signal.signal(signal.SIGALRM, known)
+    assert time.monotonic() - begin < 10 and not study.TRAININGS
+
+
 def test_settings_are_known_to_every_thread():
     """Two command lines parsed at a time spoil each other, and where standard output goes."""
     runs = study.grid(study.load("locomotion_lengths")) + study.grid(study.load("ablations"))
@@ -300,15 +328,16 @@ def test_locomotion_that_was_cut_off_goes_on(tmp_path):
 
 def test_a_report_names_its_commits():
     def row(commit, method):
-        return {"commit": commit, "method": method}
+        return {"commit": commit, "method": method, "env": "e"}
 
     ours, other = 40 * "a", 40 * "b"
     assert evidence._commits([row(ours, "x")]) == f"Commit: {ours[:12]}."
     several = [row(f"{other}-dirty", "y"), row(ours, "x"), row(ours, "y"), row("", "z")]
     several.append(row(f"{ours}+{other}", "z"))  # resumed
     assert evidence._commits(several) == (
-        f"Commit: {ours[:12]}; {other[:12]}-dirty for 1 of the runs of y; "
-        f"unknown for 1 of the runs of z; {ours[:12]}+{other[:12]} for 1 of the runs of z."
+        f"Commit: {ours[:12]}; {other[:12]}-dirty for 1 of the runs of y of e; "
+        f"unknown for 1 of the runs of z of e; {ours[:12]}+{other[:12]} for 1 of the runs of "
+        "z of e."
     )
 
 
@@ -343,6 +372,7 @@ def test_a_table_cut_off_between_its_files_mends_itself(finished, tmp_path):
     [
         (TINY.replace("seeds = 2", "seeds = true"), "seeds is a number"),
         (TINY.replace("seeds = 2", "seeds = 2\nfirst_seed = -1"), "first_seed from 0"),
+        (TINY.replace("seeds = 2", f"seeds = 2\nfirst_seed = {10**13}"), "--seed must be"),
         (TINY.replace("goal_gan =", '"../a" ='), "a method's name"),
         (TINY.replace("--method goal_gan", "--seed 7"), "--seed is the study's own"),
         (TINY.replace('"point_umaze"', '"point_umaze --seed 7"'), "--seed is the study's own"),

@@ -43,8 +43,10 @@ def curve(ax: Axes, folders: list[Path], until: int | None = None) -> None:
             raise record.RunError(f"{folder} holds no report yet: there is nothing to draw")
         known = sum(until is None or int(row["iteration"]) <= until for row in rows)
         try:
-            steps = [float(row.get("steps/train") or "nan") for row in rows]
+            steps = [int(row["steps/train"]) for row in rows]
             values = [float(row[f"eval/{measure}"]) for row in rows]
+            if not all(map(math.isfinite, values)):
+                raise ValueError(f"a {measure} is not finite")
         except ValueError as error:
             raise record.RunError(f"{folder / 'metrics.csv'} is damaged: {error}") from None
         values[known:] = [math.nan] * (len(rows) - known)
