@@ -2,8 +2,9 @@
 
     python benchmarks/recall.py --json docs/runs/recall.json
 
-The Hopper, one core, each agent alone and with the callback as it comes, alternating; timed once
-as many steps are remembered as there is room for.
+The Hopper, one core, one environment, agents and callback as they come, timed once as many steps
+are remembered as there is room for. The agent's own time is that of the same run without what the
+callback says that it took: a machine that is busy slows both alike.
 """
 
 import json
@@ -24,32 +25,55 @@ from goalgan_bt.progress import complain
 from goalgan_bt.sb3 import RecallTraces
 from goalgan_bt.settings import RecallConfig
 
-STEPS = {SAC: 6_000, PPO: 20_000, TRPO: 20_000}
+STEPS = {SAC: 6_000, PPO: 24_576, TRPO: 24_576}  # twelve turns each
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Time agents with and without recall traces."""
+    """Time agents that imitate recall traces."""
 
-    rounds: int = 2
-    """How often each is timed."""
+    rounds: int = 1
+    """Runs of each, with seeds 0, 1, ...; medians are told."""
     json: Path | None = None
     """Where to write the rows."""
 
 
-def timed(kind: Any, seed: int, traced: bool) -> tuple[int, float, float]:
-    """Steps of a run with a full memory, its milliseconds per step, and the callback's own."""
-    env = make_vec_env("Hopper-v5", n_envs=1 if kind is SAC else 4, seed=seed)
+def timed(kind: Any, seed: int) -> dict[str, float]:
+    """What a run with a full memory takes, in milliseconds: the agent's own per step, that of the
+    recall traces per step, and of these a turn."""
+    env = make_vec_env("Hopper-v5", seed=seed)
     waits = {"learning_starts": RecallConfig.capacity} if kind is SAC else {}  # that is faster
     agent = kind("MlpPolicy", env, seed=seed, device="cpu", **waits)
-    callback = RecallTraces() if traced else None
+    callback = Stopwatch(seed=seed)
     agent.learn(RecallConfig.capacity, callback=callback)
-    filled, spent = agent.num_timesteps, 0.0 if callback is None else callback.seconds
+    filled, spent = agent.num_timesteps, callback.seconds
+    callback.turns.clear()
     begin = time.perf_counter()
     agent.learn(STEPS[kind], callback=callback, reset_num_timesteps=False)
-    seconds, steps = time.perf_counter() - begin, agent.num_timesteps - filled
-    own = 0.0 if callback is None else callback.seconds - spent
-    return steps, 1e3 * seconds / steps, 1e3 * own / steps
+    own, steps = callback.seconds - spent, agent.num_timesteps - filled
+    alone = time.perf_counter() - begin - own
+    return {
+        "alone_ms_per_step": 1e3 * alone / steps,
+        "recall_ms_per_step": 1e3 * own / steps,
+        "turn_ms": 1e3 * statistics.fmean(callback.turns),
+        "share": own / alone,
+    }
+
+
+class Stopwatch(RecallTraces):
+    """Recall traces that know what each turn took."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed=seed)
+        self.turns: list[float] = []
+
+    def turn(self) -> dict[str, float]:
+        """One turn, timed."""
+        begin = time.perf_counter()
+        try:
+            return super().turn()
+        finally:
+            self.turns.append(time.perf_counter() - begin)
 
 
 def main() -> int:
@@ -64,17 +88,11 @@ def main() -> int:
     torch.set_num_threads(1)
     rows = []
     for kind in STEPS:
-        runs = [(timed(kind, i, False), timed(kind, i, True)) for i in range(settings.rounds)]
-        alone = statistics.median(run[0][1] for run in runs)
-        own = statistics.median(run[1][2] for run in runs)
+        runs = [timed(kind, seed) for seed in range(settings.rounds)]
+        found = {name: statistics.median(run[name] for run in runs) for name in runs[0]}
         rows.append(
-            {
-                "agent": kind.__name__,
-                "steps": runs[0][0][0],
-                "alone_ms_per_step": round(alone, 4),
-                "recall_ms_per_step": round(own, 4),
-                "share": round(own / alone, 4),
-            }
+            {"agent": kind.__name__, "steps": STEPS[kind]}
+            | {name: round(value, 4) for name, value in found.items()}
         )
         print(rows[-1], flush=True)
     if settings.json is not None:
