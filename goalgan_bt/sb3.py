@@ -36,6 +36,7 @@ EDGE = 0.999  # of the range of a squashed action, beyond which its inverse is t
 MOST = 5.0  # standard deviations from the mean at which a number of an observation is cut off
 FAR = 3.0  # root mean square of the standard deviations from what was seen at which a trace ends
 WAYS = 4  # that a forward model imagines from a state; the best is imitated
+HALVINGS = 10  # of a step of imitation that is too long
 KL_SAMPLE = 1024  # states on which the KL of an imitation is bounded
 
 
@@ -393,16 +394,39 @@ class RecallTraces(BaseCallback):
             self._optimiser.zero_grad()
             miss.backward()
             self._optimiser.step()
-            with torch.no_grad():
-                new_kl = np.inf
-                if all(torch.isfinite(param).all() for param in params):
-                    new_kl = kl_divergence(old, self._gaussian(reference)).sum(dim=1).mean().item()
-                if not new_kl <= max_kl:
-                    for param, value in zip(params, known, strict=True):
-                        param.copy_(value)
-                    break
-            kl = new_kl
+            halvings, new_kl = self._shorten(known, old, reference, max_kl)
+            if halvings <= HALVINGS:
+                kl = new_kl
+            if halvings:
+                break
         return {"loss": loss, "kl": kl, "log_pi": log_pi}
+
+    @torch.no_grad()
+    def _shorten(
+        self, known: list[Tensor], old: Normal, reference: Tensor, max_kl: float
+    ) -> tuple[int, float]:
+        """Halve a step of the policy, as TRPO's line search does, until it is within the bound: the
+        policy of SAC is so narrow that few of Adam's steps are. If it never is, undo it.
+
+        Args:
+            known: parameters before the step.
+            old: policy at the states `reference`, from which the KL is taken.
+
+        Returns:
+            How often it was halved, `HALVINGS + 1` if it was undone; the KL, nats.
+        """
+        params = list(self._learner.parameters())
+        for halvings in range(HALVINGS + 1):
+            if not all(torch.isfinite(param).all() for param in params):
+                break
+            kl = kl_divergence(old, self._gaussian(reference)).sum(dim=1).mean().item()
+            if kl <= max_kl:
+                return halvings, kl
+            for param, value in zip(params, known, strict=True):
+                param.lerp_(value, 0.5)
+        for param, value in zip(params, known, strict=True):
+            param.copy_(value)
+        return HALVINGS + 1, 0.0
 
     def state_dict(self) -> dict[str, Any]:
         """Settings, model and trajectories, to go on with a saved agent.

@@ -159,6 +159,23 @@ def test_imitation_moves_the_mean(name):
         np.testing.assert_array_equal(std, new_std)
 
 
+@pytest.mark.parametrize("name", ["SAC", "PPO"])
+def test_a_step_that_is_too_long_is_shortened(name):
+    """SAC's policy is so narrow that each of Adam's steps may be; one that goes nowhere is undone."""
+    callback = recall(imitation_steps=5, max_kl=1e-4, learning_rate=0.03)
+    model = agent(name, make_vec_env(Reach, n_envs=1, seed=0))
+    model.learn(300, callback=callback)
+    states = np.random.default_rng(0).uniform(-1, 1, (400, 2))
+    towards = np.tile([0.5, -0.5], (400, 1))
+    found = [callback._imitate(states, towards, states) for _ in range(20)]
+    assert all(0 < one["kl"] <= 1e-4 for one in found)
+    assert found[-1]["log_pi"] > found[0]["log_pi"]
+    callback._optimiser.param_groups[0]["lr"] = 1e6
+    known = [param.detach().clone() for param in callback._learner.parameters()]
+    assert callback._imitate(states, towards, states)["kl"] == 0
+    assert all(map(torch.equal, known, callback._learner.parameters()))
+
+
 def test_agents_that_are_not_gaussian_are_refused():
     with pytest.raises(TypeError, match="Gaussian policy"):
         DQN("MlpPolicy", "CartPole-v1").learn(10, callback=RecallTraces())
