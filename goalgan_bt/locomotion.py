@@ -95,7 +95,9 @@ def preset(env: str, method: str) -> LocomotionConfig:
             total_steps=200_000,
             num_envs=1,
             hidden=128,
-            backtracking=RecallConfig(trace_length=TRACE_LENGTH[env], fade_steps=100_000),
+            backtracking=RecallConfig(
+                trace_length=TRACE_LENGTH[env], max_kl=0.2, fade_steps=100_000
+            ),
         )
     recall = RecallConfig(trace_length=TRPO_TRACE_LENGTH[env], fade_steps=500_000)
     return LocomotionConfig(env, backtracking=recall)

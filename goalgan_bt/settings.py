@@ -236,7 +236,8 @@ class RecallConfig:
     learning_rate: float = 1e-4
     """Step size of the imitation's Adam."""
     max_kl: float = 0.005
-    """Imitation stops where the mean KL of a turn passes this, nats."""
+    """Imitation stops where the mean KL of a turn reaches this, nats. SAC changes its policy by
+    several between two turns: less than 0.2 or so is nothing beside it."""
     fade_steps: int | None = None
     """If given, that bound falls on a line to zero at this many environment steps, after which
     nothing is recalled: what helps a novice holds back an expert. The imitation is the same until

@@ -161,7 +161,7 @@ def test_imitation_moves_the_mean(name):
 
 @pytest.mark.parametrize("name", ["SAC", "PPO"])
 def test_a_step_that_is_too_long_is_shortened(name):
-    """SAC's policy is so narrow that each of Adam's steps may be; one that goes nowhere is undone."""
+    """SAC's policy is so narrow that each of Adam's may be; one that leads nowhere is undone."""
     callback = recall(imitation_steps=5, max_kl=1e-4, learning_rate=0.03)
     model = agent(name, make_vec_env(Reach, n_envs=1, seed=0))
     model.learn(300, callback=callback)
