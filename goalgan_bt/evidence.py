@@ -165,8 +165,8 @@ def report(study: Study, tables: Tables) -> None:
     runs = curves(tables)
     rows: list[dict[str, str]] = []
     text = [f"# Study {study.name}", "", f"From `python -m goalgan_bt.study {study.called}`."]
-    asked = {run.key for run in grid(study)}
-    there = sum((row["env"], row["method"], row["seed"]) in asked for row in tables.costs)
+    asked = grid(study)
+    there = sum(map(tables.has, asked))
     if there < len(asked):
         text += ["", f"**Not finished: {there} of {len(asked)} runs are in.**"]
     envs = [env for env in study.envs if any((env, method) in runs for method in study.methods)]

@@ -23,6 +23,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.sac.policies import SACPolicy
 from torch import Tensor
 from torch.distributions import Normal, kl_divergence
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from goalgan_bt.backtracking import BacktrackingModel, Transitions, recall_traces
 from goalgan_bt.checkpoint import reason, restore
@@ -31,6 +32,7 @@ from goalgan_bt.forward import ForwardModel
 from goalgan_bt.imitation import faded
 from goalgan_bt.rollout import Float32
 from goalgan_bt.settings import BacktrackingConfig, RecallConfig
+from goalgan_bt.trpo import line_search
 
 EDGE = 0.999  # of the range of a squashed action, beyond which its inverse is taken as there
 MOST = 5.0  # standard deviations from the mean at which a number of an observation is cut off
@@ -383,6 +385,13 @@ class RecallTraces(BaseCallback):
             log_pi = (before.log_prob(goals) + slope).sum(dim=1).mean().item()
         max_kl = self.max_kl()
         loss, kl, params = np.nan, 0.0, list(self._learner.parameters())
+
+        @torch.no_grad()
+        def evaluate(candidate: Tensor) -> tuple[float, float]:
+            vector_to_parameters(candidate, params)
+            new_kl = kl_divergence(old, self._gaussian(reference)).sum(dim=1).mean()
+            return 1.0, new_kl.item()  # any step is taken that is short enough
+
         for step in range(self.cfg.imitation_steps):
             some = torch.from_numpy(self._rng.integers(len(obs), size=self.cfg.imitation_batch))
             found = self._gaussian(obs[some])
@@ -390,43 +399,21 @@ class RecallTraces(BaseCallback):
             miss = -Normal(found.mean, std).log_prob(goals[some]).sum(dim=1).mean()
             if step == 0:
                 loss = miss.item()
-            known = [param.detach().clone() for param in params]
+            start = parameters_to_vector(params).detach()
             self._optimiser.zero_grad()
             miss.backward()
             self._optimiser.step()
-            halvings, new_kl = self._shorten(known, old, reference, max_kl)
-            if halvings <= HALVINGS:
-                kl = new_kl
-            if halvings:
+            full_step = parameters_to_vector(params).detach() - start
+            accepted = None  # for a policy as narrow as SAC's nearly every full step is too long
+            if torch.isfinite(full_step).all():
+                accepted = line_search(evaluate, start, full_step, max_kl, HALVINGS + 1, 0.5)
+            if accepted is None:
+                vector_to_parameters(start, params)
                 break
+            there, _, kl = accepted
+            if not torch.equal(there, start + full_step):
+                break  # shortened: it has reached the bound
         return {"loss": loss, "kl": kl, "log_pi": log_pi}
-
-    @torch.no_grad()
-    def _shorten(
-        self, known: list[Tensor], old: Normal, reference: Tensor, max_kl: float
-    ) -> tuple[int, float]:
-        """Halve a step of the policy, as TRPO's line search does, until it is within the bound: the
-        policy of SAC is so narrow that few of Adam's steps are. If it never is, undo it.
-
-        Args:
-            known: parameters before the step.
-            old: policy at the states `reference`, from which the KL is taken.
-
-        Returns:
-            How often it was halved, `HALVINGS + 1` if it was undone; the KL, nats.
-        """
-        params = list(self._learner.parameters())
-        for halvings in range(HALVINGS + 1):
-            if not all(torch.isfinite(param).all() for param in params):
-                break
-            kl = kl_divergence(old, self._gaussian(reference)).sum(dim=1).mean().item()
-            if kl <= max_kl:
-                return halvings, kl
-            for param, value in zip(params, known, strict=True):
-                param.lerp_(value, 0.5)
-        for param, value in zip(params, known, strict=True):
-            param.copy_(value)
-        return HALVINGS + 1, 0.0
 
     def state_dict(self) -> dict[str, Any]:
         """Settings, model and trajectories, to go on with a saved agent.

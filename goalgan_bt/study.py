@@ -47,8 +47,8 @@ TRAININGS: list["subprocess.Popen[str]"] = []  # what this process runs at prese
 
 class Study(NamedTuple):
     """name: of the file; envs, methods (name -> flags), seeds: the grid; flags: of all; measure:
-    what is compared, "coverage" or (locomotion) "return"; called: the command's argument. An
-    environment may have flags of its own behind its name."""
+    what is compared, "coverage" or (locomotion) "return"; called: what the command calls it, a
+    file without its folder. An environment may have flags of its own behind its name."""
 
     name: str
     envs: list[str]
@@ -136,8 +136,9 @@ def load(name: str) -> Study:
         raise UsageError(f"{wrong}{error}") from None
     if len(measures) > 1:
         raise UsageError(f"{wrong}some of its environments have a coverage, others a return")
-    of_all = flags, measures.pop(), Path(name).name
-    study = Study(path.stem, table["envs"], table["methods"], seeds, *of_all)
+    called = Path(name).name
+    envs, methods, judged_by = table["envs"], table["methods"], measures.pop()
+    study = Study(path.stem, envs, methods, seeds, flags, judged_by, called)
     *_, last = grid(study)
     for run in grid(study._replace(seeds=seeds[-1:])):
         try:
