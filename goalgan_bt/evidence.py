@@ -42,9 +42,10 @@ Steps (millions) and wall time (with one simulation thread) are means per run.""
 DIFFERENCES = "Difference to another method, paired by seed: mean and 95% interval (Student's)."
 RETURN_NOTES = """\
 Interquartile means over seeds with 95% percentile bootstrap intervals; with three seeds those are
-the mean, the lowest and the highest. Of several comparisons some differ by chance. `area`: mean
-return over the run, from the first report on. Steps (millions) and wall time (with one thread) are
-means per run."""
+the mean, the lowest and the highest, with four the mean is that of the middle two. Of several
+comparisons some differ by chance. `area`: mean return over the run, from the first report on. Steps
+(millions) and wall time are means per run; other runs shared the cores, some more than others, so
+that the times of two rows do not compare."""
 
 
 class Curve(NamedTuple):

@@ -1,8 +1,10 @@
-"""Recall traces for any Stable-Baselines3 agent with a Gaussian policy (extra `sb3`).
+"""Recall traces for those agents of Stable-Baselines3 and sb3-contrib that have a Gaussian policy:
+SAC, TRPO, PPO and A2C (extra `sb3`).
 
     from stable_baselines3 import SAC
-    from goalgan_bt.sb3 import RecallTraces
-    SAC("MlpPolicy", "Hopper-v5").learn(200_000, callback=RecallTraces())
+    from goalgan_bt.sb3 import RecallConfig, RecallTraces
+    recall = RecallTraces(RecallConfig(max_kl=0.2))  # the default suits TRPO and PPO
+    SAC("MlpPolicy", "Hopper-v5").learn(200_000, callback=recall)
 
 Goyal et al. 2019, Algorithm 1 with Algorithm 2: the best trajectories teach a backtracking model,
 which is unrolled from the most valuable states; the policy imitates those traces. The state is the
@@ -25,8 +27,8 @@ from torch import Tensor
 from torch.distributions import Normal, kl_divergence
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
+from goalgan_bt import checkpoint
 from goalgan_bt.backtracking import BacktrackingModel, Transitions, recall_traces
-from goalgan_bt.checkpoint import reason, restore
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.forward import ForwardModel
 from goalgan_bt.imitation import faded
@@ -90,7 +92,8 @@ class RecallTraces(BaseCallback):
         ValueError: for settings that make no sense.
         ValueError: when learning begins, if what is remembered is of another task's sizes.
         TypeError: when learning begins, if the agent's policy is no Gaussian (without memory or
-            state-dependent exploration), or its observations or actions are not vectors.
+            state-dependent exploration), its observations or actions are not vectors, or they are
+            wrapped once more after they have been normalised.
     """
 
     def __init__(self, cfg: RecallConfig | None = None, seed: int = 0, verbose: int = 0) -> None:
@@ -107,6 +110,7 @@ class RecallTraces(BaseCallback):
         self._agent: Any = None  # whose policy the optimiser is for
         self._sizes = (0, 0)  # of observations and actions of the model
         self._now: FloatArray = np.empty(0)  # observations before the next step
+        self._learning = False  # until `learn` has come to its end
         self.last: dict[str, float] = {}
         self.seconds = 0.0
 
@@ -126,7 +130,7 @@ class RecallTraces(BaseCallback):
         if not known or hasattr(policy, "lstm_actor") or self.model.use_sde:
             raise TypeError(
                 "RecallTraces needs an agent with a Gaussian policy, without memory or "
-                "state-dependent exploration, such as SAC, TRPO, PPO or A2C"
+                "state-dependent exploration: SAC, TRPO, PPO or A2C"
             )
         if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
             raise TypeError(f"RecallTraces needs observations that are vectors, not {space}")
@@ -147,19 +151,33 @@ class RecallTraces(BaseCallback):
             self._agent, self._turned = self.model, self.model.num_timesteps
             self._optimiser = torch.optim.Adam(self._learner.parameters(), self.cfg.learning_rate)
             self._paths: list[list[tuple[Any, Any, float]]] = [[] for _ in range(self.model.n_envs)]
+            self._whole = np.zeros(self.model.n_envs, dtype=bool)  # seen from their beginning
         if self._moments is not None and _fit(self._moments, self._optimiser):
-            restore(self._optimiser, self._moments)
+            checkpoint.restore(self._optimiser, self._moments)
         self._moments = None
 
     def _on_training_start(self) -> None:
         self._normalising = self.model.get_vec_normalize_env()
         begin, anew = self._original(self.model._last_obs), self.locals["reset_num_timesteps"]
+        expected = self.model.observation_space.shape
+        if begin.shape[1:] != expected:
+            raise TypeError(
+                f"RecallTraces cannot see the observations {expected} of the agent before they are "
+                f"normalised, only {begin.shape[1:]}: let VecNormalize be the outermost wrapper"
+            )
         if anew:
             self._turned = 0
-        if anew or not np.array_equal(begin, self._now):  # the environments have been reset
+        anew = anew or not self.model.num_timesteps
+        if anew or self._learning or not np.array_equal(begin, self._now):
+            # The environments have been reset, or went on without us, for a step perhaps where
+            # `learn` did not come to its end: what they are in the middle of is not remembered.
             for path in self._paths:
                 path.clear()
-        self._now = begin
+            self._whole[:] = anew
+        self._now, self._learning = begin, True
+
+    def _on_training_end(self) -> None:
+        self._learning = False
 
     def _original(self, obs: Any) -> FloatArray:
         """The last observations as the environments gave them: what an agent that normalises has
@@ -183,13 +201,16 @@ class RecallTraces(BaseCallback):
             rewards = normalising.get_original_reward()
         for i, path in enumerate(self._paths):
             path.append((self._now[i], told[i], float(rewards[i])))
-            if given["dones"][i]:
+            if not given["dones"][i]:
+                continue
+            if self._whole[i]:
                 info = given["infos"][i]
                 last, timeout = info["terminal_observation"], info.get("TimeLimit.truncated", False)
                 if normalising is not None:
                     last = normalising.unnormalize_obs(last)
                 self._remember(path, last, not timeout)
-                path.clear()
+            path.clear()
+            self._whole[i] = True
         self._now = self._original(given["new_obs"])
         self.seconds += time.perf_counter() - begin
         return True
@@ -410,7 +431,7 @@ class RecallTraces(BaseCallback):
             if accepted is None:
                 vector_to_parameters(start, params)
                 break
-            there, _, kl = accepted
+            there, _, kl = accepted  # and in place: the last that was tried
             if not torch.equal(there, start + full_step):
                 break  # shortened: it has reached the bound
         return {"loss": loss, "kl": kl, "log_pi": log_pi}
@@ -440,21 +461,28 @@ class RecallTraces(BaseCallback):
         the imitation begins anew where the agent is another than it was.
 
         Raises:
-            ValueError: if there is no trajectory, or one that is none.
+            ValueError: if there is no trajectory, or one that is none, or a number is not finite.
         """
-        sizes = set()
+        if not isinstance(state["optimiser"], dict | None):
+            raise ValueError("the optimiser's part is none")
+        self.trajectories.clear()
+        self._remembered, sizes = 0, set()
         for obs, actions, rewards, terminated in state["trajectories"]:
             one = Trajectory(obs.numpy(), actions.numpy(), rewards.numpy(), terminated)
             sizes.add((one.obs.shape[1], one.actions.shape[1]))
             if not len(one.obs) - 1 == len(one.actions) == len(one.rewards):
                 raise ValueError("a trajectory's parts differ in length")
+            if not all(np.isfinite(part).all() for part in one[:3]):
+                raise ValueError("a trajectory has numbers that are not finite")
             self.trajectories.append(one)
             self._remembered += len(one.rewards)
         if len(sizes) != 1:
             raise ValueError(f"it must hold trajectories of one task, not of {len(sizes)}")
         self.dynamics = self._new_model(*sizes.pop())
         self.dynamics.load_state_dict(state["model"])
-        restore(self.dynamics.optimiser, state["model_optimiser"])
+        if not all(param.isfinite().all() for param in self.dynamics.parameters()):
+            raise ValueError("the model has numbers that are not finite")
+        checkpoint.restore(self.dynamics.optimiser, state["model_optimiser"])
         self._moments = state["optimiser"]
 
     def save(self, path: Path | str) -> None:
@@ -462,8 +490,9 @@ class RecallTraces(BaseCallback):
 
         Raises:
             ValueError: if no episode has ended yet.
+            OSError: if the file cannot be written; an old one is left as it was.
         """
-        torch.save(self.state_dict(), path)
+        checkpoint.save(self.state_dict(), Path(path))
 
     @classmethod
     def load(
@@ -489,7 +518,7 @@ class RecallTraces(BaseCallback):
         except OSError:
             raise
         except Exception as error:  # torch raises many kinds for a damaged file
-            why = f"it is damaged or of other settings ({reason(error)})"
+            why = f"it is damaged or of other settings ({checkpoint.reason(error)})"
             raise ValueError(f"cannot load {path}: {why}") from error
         return callback
 

@@ -41,7 +41,8 @@ def test_a_run_of_the_hopper(method, steps, tmp_path):
         rows = list(csv.DictReader(file))
     assert int(rows[-1]["steps/train"]) >= steps
     assert [int(row["iteration"]) for row in rows] == list(range(1, len(rows) + 1))
-    assert float(rows[-1]["eval/return"]) > 0 and float(rows[-1]["recall/kl"]) >= 0
+    assert float(rows[-1]["eval/return"]) > 20
+    assert 0 < float(rows[-1]["recall/kl"]) <= {"trpo": 0.005, "sac": 0.2}[method]
     saved = torch.load(folder / "policy.pt", weights_only=True)
     weights = saved["policy"]
     assert ("mean" in saved) == (method == "trpo")

@@ -1,5 +1,7 @@
 """The plug-in for Stable-Baselines3: three agents on a task that knows nothing of us."""
 
+import time
+
 import gymnasium
 import numpy as np
 import pytest
@@ -9,10 +11,11 @@ from gymnasium import spaces
 pytest.importorskip("stable_baselines3")
 sb3_contrib = pytest.importorskip("sb3_contrib")
 from stable_baselines3 import DQN, PPO, SAC  # noqa: E402
+from stable_baselines3.common.callbacks import BaseCallback  # noqa: E402
 from stable_baselines3.common.env_util import make_vec_env  # noqa: E402
 from stable_baselines3.common.evaluation import evaluate_policy  # noqa: E402
 from stable_baselines3.common.logger import configure  # noqa: E402
-from stable_baselines3.common.vec_env import VecNormalize  # noqa: E402
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize  # noqa: E402
 
 from goalgan_bt import sb3  # noqa: E402
 from goalgan_bt.sb3 import RecallConfig, RecallTraces, Seen, Trajectory  # noqa: E402
@@ -183,6 +186,9 @@ def test_agents_that_are_not_gaussian_are_refused():
         PPO("MlpPolicy", make_vec_env(Reach), use_sde=True).learn(10, callback=RecallTraces())
     with pytest.raises(TypeError, match="vectors of numbers"):
         PPO("MlpPolicy", "CartPole-v1").learn(10, callback=RecallTraces())
+    stacked = VecFrameStack(VecNormalize(make_vec_env(Reach)), 4)
+    with pytest.raises(TypeError, match=r"observations \(8,\) .* only \(2,\): let VecNormalize"):
+        PPO("MlpPolicy", stacked).learn(10, callback=RecallTraces())
     with pytest.raises(ValueError, match="nothing was learned"):
         RecallTraces().save("nowhere")
 
@@ -199,6 +205,8 @@ def test_what_was_saved_for_another_task_is_refused(tmp_path):
         RecallTraces.load(tmp_path / "recall.pt", RecallConfig(model="forward"))
     with pytest.raises(FileNotFoundError):
         RecallTraces.load(tmp_path / "nowhere.pt")
+    with pytest.raises(FileNotFoundError):
+        callback.save(tmp_path / "no folder" / "recall.pt")
 
 
 def test_damaged_files_are_refused_in_one_line(tmp_path):
@@ -216,6 +224,9 @@ def test_damaged_files_are_refused_in_one_line(tmp_path):
         ({"a": 1}, "KeyError 'cfg'"),
         (state | {"trajectories": []}, "of one task"),
         (state | {"trajectories": [[obs[1:], *others]]}, "differ in length"),
+        (state | {"trajectories": [[obs * np.nan, *others]]}, "trajectory has .* not finite"),
+        (state | {"model": {k: v * np.nan for k, v in state["model"].items()}}, "model has"),
+        (state | {"optimiser": [3]}, "the optimiser's part is none"),
     ):
         if isinstance(bad, bytes):
             path.write_bytes(bad)
@@ -261,7 +272,7 @@ def test_learning_goes_on_where_it_was_or_anew():
     model.learn(80, callback=callback)
     assert {len(one.rewards) for one in callback.trajectories} == {30}
     assert len(callback.trajectories) == before + 2
-    model.set_env(make_vec_env(Reach, n_envs=2, seed=1))  # whose episodes begin as they do
+    model.set_env(make_vec_env(Reach, n_envs=2, seed=1))  # whose first episodes may be any
     model.learn(160, callback=callback, reset_num_timesteps=False)
     for one in callback.trajectories:
         moved = np.clip(one.obs[:-1] + one.actions * FASTEST, -2, 2)
@@ -418,3 +429,185 @@ def test_settings_that_make_no_sense_are_refused(bad):
 
 def test_numbers_of_numpy_are_numbers():
     RecallTraces(RecallConfig(trace_length=np.int64(5), learning_rate=np.float32(1e-4)))
+
+
+def assert_whole(callback, least):
+    """That every episode remembered is one: 30 steps, on end."""
+    assert len(callback.trajectories) >= least
+    for obs, actions, _, _ in callback.trajectories:
+        assert len(actions) == 30
+        np.testing.assert_allclose(np.clip(obs[:-1] + actions * FASTEST, -2, 2), obs[1:], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["SAC", "PPO"])
+def test_an_episode_of_which_only_the_end_was_seen_is_forgotten(name):
+    """Where the agent went on without us, or steps were lost when another callback stopped it."""
+    small = {} if name == "SAC" else {"n_steps": 40, "batch_size": 80}
+    model, callback = agent(name, make_vec_env(Reach, n_envs=2, seed=0), **small), recall()
+    model.learn(80)  # 40 steps each, so that both are in the middle of an episode
+    model.learn(160, callback=callback, reset_num_timesteps=False)  # to the 120th
+    assert_whole(callback, 4)
+    model.learn(80, reset_num_timesteps=False)  # without us, to the 160th
+    model.learn(160, callback=callback, reset_num_timesteps=False)
+    assert_whole(callback, 8)
+
+    class Stop(BaseCallback):
+        def _on_step(self):
+            return self.n_calls < 7
+
+    model.learn(80, callback=[callback, Stop()], reset_num_timesteps=False)
+    before = len(callback.trajectories)
+    model.learn(160, callback=callback, reset_num_timesteps=False)
+    assert_whole(callback, before + 2)
+
+    class Interrupt(BaseCallback):  # as Ctrl-C: the environments have moved, nobody was told
+        def _on_step(self):
+            if self.n_calls == 7:
+                raise KeyboardInterrupt
+            return True
+
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(80, callback=[Interrupt(), callback], reset_num_timesteps=False)
+    before = len(callback.trajectories)
+    model.learn(160, callback=callback, reset_num_timesteps=False)
+    assert_whole(callback, before + 2)
+
+    first = recall()
+    agent(name, model.get_env(), **small).learn(80, callback=first, reset_num_timesteps=False)
+    assert_whole(first, 2)  # nothing was missed
+
+
+@pytest.mark.parametrize("name", ["SAC", "PPO"])
+def test_the_likelihood_told_is_that_of_the_policy(name):
+    """Of Stable-Baselines3's own density of an action, in actions from -1 to 1."""
+    model, callback = agent(name, make_vec_env(Reach, n_envs=1, seed=0)), recall()
+    model.learn(300, callback=callback)
+    rng = np.random.default_rng(0)
+    states, actions = rng.uniform(-1, 1, (300, 2)), rng.uniform(-0.9, 0.9, (300, 2))
+    obs, done = torch.as_tensor(states).float(), torch.as_tensor(actions).float()
+    with torch.no_grad():
+        if name == "SAC":
+            mean, log_std, _ = model.actor.get_action_dist_params(obs)
+            said = model.actor.action_dist.proba_distribution(mean, log_std).log_prob(done)
+        else:  # whose actions are the environment's: a smaller unit, a higher density
+            scale = torch.from_numpy(FASTEST)
+            said = model.policy.evaluate_actions(obs, done * scale)[1] + scale.log().sum()
+    told = callback._imitate(states, actions, states)
+    assert told["log_pi"] == pytest.approx(said.mean().item(), rel=1e-4)
+
+
+def test_the_ratio_told_is_of_policy_and_model(monkeypatch):
+    """log pi(a | s) - log q(a | s'), s' the state after, over the steps before a trace ended."""
+    callback, found = recall(), []
+    model = agent("PPO", make_vec_env(Reach, n_envs=2, seed=0))
+    model.learn(2048, callback=callback)
+    unroll = sb3.recall_traces
+
+    def cut(*given):
+        traces = unroll(*given)
+        traces.valid[3:, ::2] = False
+        found.append((given[2], traces))
+        return traces
+
+    monkeypatch.setattr(sb3, "recall_traces", cut)
+    monkeypatch.setattr(callback, "_imitate", lambda s, a, seen: {"log_pi": 7.0})
+    told = callback.turn()
+    ((seeds, (states, actions, valid)),) = [(s, t[:3]) for s, t in found]
+    densities = []
+    for i in range(len(seeds)):
+        after = seeds[i]
+        for t in range(5):
+            if valid[t, i]:
+                at, did = (torch.as_tensor(x[None]).float() for x in (after, actions[t, i]))
+                densities.append(callback.dynamics.action_log_density(at, did).item())
+            after = states[t, i]
+    assert len(densities) == valid.sum() and 0 < told["valid"] < 1
+    assert told["log_ratio"] == pytest.approx(7 - np.mean(densities), rel=1e-4)
+
+
+def test_states_far_from_what_was_seen_are_not_valid():
+    obs = np.array([[0.0, 10.0], [2.0, 30.0]])  # mean 1 and 20, std 1 and 10
+    space = Seen(obs, 1)
+    near = [[1.0, 20.0], [1 + 2.9, 20 + 29], [1 + 4.2, 20.0]]  # at most 3 deviations, on average
+    far = [[1 + 3.1, 20 - 31], [1 + 4.3, 20.0], [1.0, np.nan], [np.inf, 20.0]]
+    assert space.valid(np.array(near + far)).tolist() == [True] * 3 + [False] * 4
+    cut = space.repair(np.array([[1.5, 25.0], [100.0, -1000.0]]))
+    np.testing.assert_allclose(cut, [[1.5, 25.0], [6.0, -30.0]], atol=0.01)
+
+
+def test_the_optimiser_goes_on_where_it_was(tmp_path):
+    model, callback = agent("PPO", make_vec_env(Reach, seed=0)), recall()
+    model.learn(2048, callback=callback)
+    callback.save(tmp_path / "recall.pt")
+    again = RecallTraces.load(tmp_path / "recall.pt")
+    for _ in range(2):  # what it held before is replaced
+        again.load_state_dict(callback.state_dict())
+    assert len(again.trajectories) == len(callback.trajectories)
+    again.init_callback(model)
+    ours, theirs = (one._optimiser.state_dict()["state"] for one in (callback, again))
+    assert ours and ours.keys() == theirs.keys()
+    assert all(torch.equal(ours[i]["exp_avg"], theirs[i]["exp_avg"]) for i in ours)
+
+
+def test_rewards_and_values_are_added_in_the_critics_units(monkeypatch):
+    """Where rewards are normalised, its values are of normalised ones."""
+    env = VecNormalize(make_vec_env(Reach, n_envs=2, seed=0))
+    callback, begun, unroll = recall(traces=1), [], sb3.recall_traces
+    agent("PPO", env).learn(1024, callback=callback)
+    monkeypatch.setattr(sb3, "recall_traces", lambda *a: begun.append(a[2][0]) or unroll(*a))
+    callback._values = lambda obs: 1.0 * (obs[:, 0] > np.median(obs[:, 0]))
+    line = np.linspace(-1, 1, 201)
+    obs, rewards = np.column_stack([line, line]), np.zeros(200)
+    rewards[50] = 5.0  # in the half of no value
+    callback.trajectories.clear()
+    for less in (0, 1):
+        callback.trajectories.append(Trajectory(obs, np.zeros((200, 2)), rewards - less, False))
+    for variance in (27.7, 40.0):  # a reward of 5 is 0.95, or 0.79; a value of 1 is 0.9 before it
+        env.ret_rms.var = variance
+        callback.turn()
+    middle = env.normalize_obs(np.zeros(2))[0]
+    left, right = (x - middle for x, _ in begun)
+    assert left < 0 < right
+
+
+def test_the_value_beside_sac_is_the_lower_of_its_critics():
+    model, callback = agent("SAC", make_vec_env(Reach, n_envs=1, seed=0)), recall()
+    model.learn(300, callback=callback)
+    states = np.random.default_rng(0).uniform(-1, 1, (50, 2))
+    obs = torch.as_tensor(states).float()
+    with torch.no_grad():
+        both = model.critic(obs, model.actor(obs, deterministic=True))
+    lower = torch.minimum(*both)[:, 0]
+    assert not torch.equal(lower, both[0][:, 0])
+    np.testing.assert_allclose(callback._values(states), lower, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["SAC", "PPO"])
+def test_imitation_ends_where_the_bound_is_reached(name):
+    """After the step that had to be shortened, and one that is not finite is not taken."""
+    callback = recall(imitation_steps=5, max_kl=1e-4, learning_rate=0.03)
+    model = agent(name, make_vec_env(Reach, n_envs=1, seed=0))
+    model.learn(300, callback=callback)
+    states = np.random.default_rng(0).uniform(-1, 1, (400, 2))
+    assert callback._imitate(states, np.full((400, 2), 0.5), states)["kl"] > 0
+    (taken,) = {int(one["step"]) for one in callback._optimiser.state.values()}
+    assert taken == 1
+    callback._optimiser.param_groups[0]["lr"] = np.nan
+    known = [param.detach().clone() for param in callback._learner.parameters()]
+    assert callback._imitate(states, np.full((400, 2), 0.5), states)["kl"] == 0
+    assert all(map(torch.equal, known, callback._learner.parameters()))
+
+
+def test_every_turn_learns_from_all_that_is_remembered_and_its_time_counts(monkeypatch):
+    callback, seen = recall(), []
+    model = agent("PPO", make_vec_env(Reach, n_envs=2, seed=0))
+    model.learn(1024, callback=callback)
+    fit, before = callback.dynamics.fit, callback.seconds
+    monkeypatch.setattr(
+        callback.dynamics, "fit", lambda data: seen.append(callback.dynamics.seen) or fit(data)
+    )
+    turn = callback.turn
+    monkeypatch.setattr(callback, "turn", lambda: time.sleep(0.5) or turn())
+    model.learn(1536, callback=callback, reset_num_timesteps=False)
+    assert len(seen) >= 2 and set(seen) == {0}
+    assert callback.dynamics.seen > 0 and callback.seconds - before > 0.5 * len(seen)
