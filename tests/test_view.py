@@ -333,6 +333,16 @@ def test_a_click_leads_to_an_attempt_with_an_outcome(view):
     assert "Goal (0.2, 0.0): **reached** after" in view._outcome.content
 
 
+def test_how_an_attempt_ended_is_told_however_late(view):
+    view._ask("goal", np.array([0.2, 0.0]))
+    now = time.monotonic()
+    view.tick(now)
+    view._play_body(now)
+    assert "on its way" in view._outcome.content
+    view._play_body(now + 1000)  # a busy machine, or nobody looked
+    assert "Goal (0.2, 0.0): **reached** after" in view._outcome.content
+
+
 def test_a_click_into_a_wall_is_answered(view):
     view._ask("goal", np.array([0.0, 2.0]))
     view.tick(time.monotonic())

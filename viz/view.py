@@ -175,6 +175,8 @@ class View:
         if len(self.runs) > 1 or not (self._scenes[0].visible("body") or self._asked):
             return
         if self._attempt is None or now - self._attempt_began > self._attempt.seconds + PAUSE:
+            if self._asked:  # the last look may have been long ago
+                self._outcome.content = self._describe_attempt(now)
             self._asked = False
             if not self._ready():
                 return
@@ -247,9 +249,9 @@ class View:
                 if not env.feasible(goals)[0]:
                     self._outcome.content = "No body can be there: click on a free place."
                     return
-            self._asked = True
             self._outcome.content = "..."
             self._begin(goals)
+            self._asked = True
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
