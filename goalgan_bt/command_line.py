@@ -8,7 +8,7 @@ import signal
 import sys
 from collections.abc import Callable
 from operator import attrgetter
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import tyro
 
@@ -107,6 +107,14 @@ def exit_code(
         complain(str(error))
         return 2
     return 0
+
+
+def leave(code: int) -> NoReturn:
+    """End the process with an exit code. What was done is done: a signal in the second that this
+    may take changes neither the code nor the last line."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    sys.exit(code)
 
 
 def value_of(argv: list[str], flag: str) -> str | None:

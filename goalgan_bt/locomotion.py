@@ -355,7 +355,9 @@ def main() -> int:
         say(f"return {found:.1f} at the end of training: {folder}")
 
     def how_to_go_on() -> str:
-        if folder is None or not (folder / "checkpoint.pt").exists():
+        if folder is None:
+            return "it had not begun, give the same command again"
+        if not (folder / "checkpoint.pt").exists():
             return "nothing was saved yet: start again"
         return f"go on from the last measurement with --resume {folder}"
 

@@ -136,6 +136,8 @@ class RecallTraces(BaseCallback):
             raise TypeError(f"RecallTraces needs observations that are vectors, not {space}")
         if not (isinstance(actions, spaces.Box) and len(actions.shape) == 1):
             raise TypeError(f"RecallTraces needs actions that are vectors of numbers: {actions}")
+        if not (actions.high > actions.low).all():
+            raise TypeError(f"RecallTraces needs actions that can vary in every number: {actions}")
         self._squashed = isinstance(policy, SACPolicy)
         self._learner = policy.actor if self._squashed else policy
         self._low, self._high = actions.low.astype(float), actions.high.astype(float)

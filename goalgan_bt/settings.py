@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Literal
 
+MOST_RECALLED = 1_000_000  # steps of traces per turn: beyond it memory, not sense, is the limit
+
 
 @dataclass(frozen=True)
 class PolicyConfig:
@@ -256,6 +258,10 @@ class RecallConfig:
             number = isinstance(value, Real) and not isinstance(value, bool)
             if not number or not 0 < value < math.inf:
                 return f"{name} must be finite and greater than 0, not {value!r}"
+        if int(self.trace_length) * int(self.traces) > MOST_RECALLED:
+            return f"trace_length times traces must be at most {MOST_RECALLED} steps"
+        if self.imitation_batch > MOST_RECALLED:
+            return f"imitation_batch must be at most {MOST_RECALLED}, not {self.imitation_batch}"
         fade = self.fade_steps
         if fade is not None and (type(fade) is bool or not isinstance(fade, Integral) or fade < 1):
             return f"fade_steps must be a whole number from 1 on, or None, not {fade!r}"

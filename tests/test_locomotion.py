@@ -222,3 +222,20 @@ def test_bad_flags_end_in_one_line(flags, words, tmp_path):
     done = run_module("train", "--env", "hopper", "--out", tmp_path, *flags)
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and words in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_after_the_last_line_changes_nothing(number, tmp_path):
+    flags = ["--env", "hopper", "--method", "trpo", "--total-steps", "100"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "goalgan_bt.train", *flags, "--out", tmp_path],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as running:
+        while " at the end of training" not in running.stdout.readline():
+            assert running.poll() is None
+        time.sleep(0.05)
+        running.send_signal(number)
+        _, errors = running.communicate(timeout=60)
+    assert running.returncode == 0 and not errors

@@ -186,6 +186,10 @@ def test_agents_that_are_not_gaussian_are_refused():
         PPO("MlpPolicy", make_vec_env(Reach), use_sde=True).learn(10, callback=RecallTraces())
     with pytest.raises(TypeError, match="vectors of numbers"):
         PPO("MlpPolicy", "CartPole-v1").learn(10, callback=RecallTraces())
+    narrow = make_vec_env(Reach)
+    narrow.action_space = spaces.Box(np.float32([-1, 0]), np.float32([1, 0]))
+    with pytest.raises(TypeError, match="can vary"):
+        PPO("MlpPolicy", narrow).learn(10, callback=RecallTraces())
     stacked = VecFrameStack(VecNormalize(make_vec_env(Reach)), 4)
     with pytest.raises(TypeError, match=r"observations \(8,\) .* only \(2,\): let VecNormalize"):
         PPO("MlpPolicy", stacked).learn(10, callback=RecallTraces())
@@ -420,6 +424,8 @@ def test_traces_begin_where_it_pays_to_be(monkeypatch):
         {"top_percent": True},
         {"fade_steps": 0},
         {"fade_steps": 2.5},
+        {"trace_length": 10**9},
+        {"imitation_batch": 10**9},
     ],
 )
 def test_settings_that_make_no_sense_are_refused(bad):
