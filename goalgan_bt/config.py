@@ -22,6 +22,7 @@ from goalgan_bt.settings import (
     RolloutConfig,
     TrpoConfig,
     ValueConfig,
+    too_much,
 )
 
 # What a resumed run must keep: another world or other randomness would be another run.
@@ -233,6 +234,8 @@ def check(cfg: Config) -> None:
         raise ConfigError(
             "--backtracking.min-transitions must not be more than --backtracking.buffer"
         )
+    if problem := too_much(cfg.backtracking.trace_length, cfg.backtracking.traces):
+        raise ConfigError(f"--backtracking: {problem}")
     if cfg.horizon is not None and cfg.horizon % cfg.action_repeat:
         raise ConfigError("--horizon must be a multiple of --action-repeat")
     if cfg.map is not None and cfg.env == "point_nd":

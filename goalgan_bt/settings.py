@@ -9,7 +9,14 @@ from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Literal
 
-MOST_RECALLED = 1_000_000  # steps of traces per turn: beyond it memory, not sense, is the limit
+MOST_RECALLED = 1_000_000  # steps at a time: beyond it memory, not sense, is the limit
+
+
+def too_much(trace_length: int, traces: int) -> str | None:
+    """Why so many recall traces of this length cannot be unrolled at once; None if they can."""
+    if int(trace_length) * int(traces) <= MOST_RECALLED:  # numpy's own integers would overflow
+        return None
+    return f"trace_length times traces must be at most {MOST_RECALLED} steps"
 
 
 @dataclass(frozen=True)
@@ -258,8 +265,8 @@ class RecallConfig:
             number = isinstance(value, Real) and not isinstance(value, bool)
             if not number or not 0 < value < math.inf:
                 return f"{name} must be finite and greater than 0, not {value!r}"
-        if int(self.trace_length) * int(self.traces) > MOST_RECALLED:
-            return f"trace_length times traces must be at most {MOST_RECALLED} steps"
+        if long := too_much(self.trace_length, self.traces):
+            return long
         if self.imitation_batch > MOST_RECALLED:
             return f"imitation_batch must be at most {MOST_RECALLED}, not {self.imitation_batch}"
         fade = self.fade_steps

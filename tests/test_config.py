@@ -32,6 +32,7 @@ def test_the_command_line_overrides_the_preset(env):
         (["--trpo.max-kl", "0"], "--trpo.max-kl must be greater than 0"),
         (["--discount", "1.5"], "--discount must be between 0 and 1"),
         (["--backtracking.trace-length", "-1"], "--backtracking.trace-length must be 0 or more"),
+        (["--backtracking.trace-length", "1000000000"], "trace_length times traces must be"),
         (["--goals.r-min", "0.9"], "--goals.r-min must be less"),
         (["--no-such-flag", "1"], "no-such-flag"),
         (["--seed", "three"], "--seed cannot be 'three'; --help tells what it takes"),
