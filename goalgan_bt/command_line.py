@@ -109,7 +109,7 @@ def exit_code(
     return 0
 
 
-def leave(code: int) -> NoReturn:
+def exit_with(code: int) -> NoReturn:
     """End the process with an exit code. What was done is done: a signal in the second that this
     may take changes neither the code nor the last line."""
     for number in (signal.SIGINT, signal.SIGTERM):

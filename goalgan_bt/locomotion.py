@@ -355,10 +355,8 @@ def main() -> int:
         say(f"return {found:.1f} at the end of training: {folder}")
 
     def how_to_go_on() -> str:
-        if folder is None:
-            return "it had not begun, give the same command again"
-        if not (folder / "checkpoint.pt").exists():
-            return "nothing was saved yet: start again"
+        if folder is None or not (folder / "checkpoint.pt").exists():
+            return "nothing new was saved, give the same command again"
         return f"go on from the last measurement with --resume {folder}"
 
     return exit_code(work, how_to_go_on)

@@ -34,7 +34,7 @@ from typing import Any, Literal, NamedTuple
 import tyro
 
 from goalgan_bt import config, locomotion, record
-from goalgan_bt.command_line import UsageError, exit_code, leave, parse
+from goalgan_bt.command_line import UsageError, exit_code, exit_with, parse
 from goalgan_bt.progress import complain, say
 
 SHIPPED = Path(__file__).parent / "studies"
@@ -420,4 +420,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    leave(main())
+    exit_with(main())

@@ -13,7 +13,7 @@ import sys
 if __name__ == "__main__":
     # What follows takes seconds to import. Ctrl-C or `kill` meanwhile has nothing to save.
     def _leave(number: int, _: object) -> None:
-        os.write(2, b"error: interrupted: it had not begun, give the same command again\n")
+        os.write(2, b"error: interrupted: nothing new was saved, give the same command again\n")
         os._exit(130 if number == signal.SIGINT else 2)
 
     signal.signal(signal.SIGINT, _leave)
@@ -21,7 +21,7 @@ if __name__ == "__main__":
     from goalgan_bt import command_line, config, record
 
     if other := config.other_learner(sys.argv):  # it needs none of what follows
-        command_line.leave(other.main())
+        command_line.exit_with(other.main())
     if {"-h", "--help"} & set(sys.argv):
         try:
             config.from_command_line()  # ends here
@@ -472,12 +472,10 @@ def how_to_go_on(folder: Path | None) -> str:
     """The end of a message about a run that stopped early."""
     if folder is None and ranks.rank() > 0:
         return ""  # only rank 0 knows
-    if folder is None:
-        return ": it had not begun, give the same command again"
-    if not (folder / "checkpoint.pt").exists():
-        return ": nothing was saved yet, start again"
+    if folder is None or not (folder / "checkpoint.pt").exists():
+        return ": nothing new was saved, give the same command again"
     return f": go on from the last checkpoint with --resume {folder}"
 
 
 if __name__ == "__main__":
-    command_line.leave(main())
+    command_line.exit_with(main())

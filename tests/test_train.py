@@ -272,7 +272,7 @@ def test_interrupted_while_it_imports_it_says_one_line(number, code):
     process.send_signal(number)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == code
-    assert errors == "error: interrupted: it had not begun, give the same command again\n"
+    assert errors == "error: interrupted: nothing new was saved, give the same command again\n"
 
 
 def test_a_full_disk_is_one_line(tmp_path):
