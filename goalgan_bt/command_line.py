@@ -7,6 +7,7 @@ import re
 import signal
 import sys
 from collections.abc import Callable
+from itertools import pairwise
 from operator import attrgetter
 from typing import Any, NoReturn, TypeVar
 
@@ -120,8 +121,8 @@ def exit_with(code: int) -> NoReturn:
 def value_of(argv: list[str], flag: str) -> str | None:
     """The value given to a flag, as `--flag value` or `--flag=value`; the last one counts."""
     value = None
-    for word, following in zip(argv, [*argv[1:], None], strict=True):
-        if word == flag and following is not None and not following.startswith("--"):
+    for word, following in pairwise([*argv, ""]):
+        if word == flag and following and not following.startswith("--"):
             value = following
         elif word.startswith(flag + "="):
             value = word.split("=", 1)[1]

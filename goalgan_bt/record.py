@@ -351,6 +351,25 @@ def read_meta(folder: Path) -> dict[str, Any]:
     return meta
 
 
+def maze_of(folder: Path) -> Maze | None:
+    """The maze of a run, or None for an environment without walls.
+
+    Raises:
+        RunError: if the folder is no run.
+    """
+    meta = read_meta(folder)
+    try:
+        maze = meta["maze"]
+        if maze is None:
+            return None
+        side = float(maze["cell_size"])
+        if not 0 < side < 1e3:
+            raise ValueError(f"cells of {side} m")
+        return Maze(tuple(maze["rows"]), side)
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunError(f"{folder / 'meta.json'} is damaged: {error!r}") from None
+
+
 def frames(folder: Path) -> list[Path]:
     """The frames of a run, oldest first."""
     return sorted(f for f in (folder / "frames").glob("*.npz") if f.stem.isdecimal())

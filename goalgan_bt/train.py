@@ -364,7 +364,15 @@ def resident_mib() -> float:
 
 
 def make_env(cfg: Config, num_envs: int, maze: Maze | None = None) -> GoalEnv:
-    """The environment that the settings name, in another maze if one is given."""
+    """The environment that the settings name, in another maze if one is given. A run that goes on
+    does so in the maze that its folder has recorded: a map's file may be another by now, or gone.
+
+    Raises:
+        MapError: for a map that is not a maze.
+        RunError: if the maze that was recorded cannot be read.
+    """
+    if maze is None and cfg.resume is not None:
+        maze = record.maze_of(cfg.resume)
     return envs.make(
         cfg.env,
         num_envs,

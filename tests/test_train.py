@@ -244,6 +244,34 @@ def test_a_broken_map_names_its_place(tmp_path):
     assert "mine.txt: row 2, column 3: unknown character 'X'" in done.stderr
 
 
+def test_without_arguments_it_trains_the_ant(tmp_path):
+    words = [sys.executable, "-m", "goalgan_bt.train"]
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(words, cwd=tmp_path, stdout=pipe, stderr=pipe, text=True)
+    first = process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert first.startswith("run folder: runs/ant_umaze-"), errors
+    assert process.returncode == 130 and "Traceback" not in errors
+
+
+@pytest.mark.parametrize("now", ["another map", "no map"])
+def test_a_resumed_run_stays_in_its_own_maze(tmp_path, now):
+    path = tmp_path / "mine.txt"
+    path.write_text("#####\n#S..#\n#####\n")
+    out = tmp_path / "runs"
+    done = run("--env", "point_umaze", "--map", path, "--iterations", 2, out=out)
+    assert done.returncode == 0, done.stderr
+    path.unlink()
+    if now == "another map":
+        path.write_text("######\n#S...#\n######\n")
+    (folder,) = out.iterdir()
+    done = run("--resume", folder, "--iterations", 4, out=out)
+    assert done.returncode == 0, done.stderr
+    tiles = {len(record.read_frame(frame)["test_goals"]) for frame in record.frames(folder)}
+    assert tiles == {3 * 16}  # three free cells, throughout
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 2)])
 def test_interrupted_runs_leave_a_checkpoint_that_resumes(tmp_path, number, code):
     process, folder = start(out=tmp_path)

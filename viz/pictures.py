@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 
 from goalgan_bt import record
 from goalgan_bt.viz.published import Published, published
-from goalgan_bt.viz.run import Run, labels, maze_of, places, success
+from goalgan_bt.viz.run import Run, labels, places, success
 
 # Red (never reached) over pale yellow to blue (mastered): readable for colour-blind people.
 COLOURS = "RdYlBu"
@@ -39,7 +39,7 @@ def curve(ax: Axes, folders: list[Path], until: int | None = None) -> None:
     references: dict[Published, None] = {}  # in the order given
     for i, (folder, (_, rows)) in enumerate(zip(folders, tables, strict=True)):
         rows = [row for row in rows if row.get(f"eval/{measure}")]
-        if not rows and maze_of(folder) is None:
+        if not rows and record.maze_of(folder) is None:
             raise record.RunError(f"{folder} holds no report yet: there is nothing to draw")
         known = sum(until is None or int(row["iteration"]) <= until for row in rows)
         try:
@@ -88,7 +88,7 @@ def coverage_map(ax: Axes, folder: Path, frame: Path, goals: float = 7.0) -> Any
     Raises:
         RunError: if the folder is no run or its goals are not places in a maze.
     """
-    maze = maze_of(folder)
+    maze = record.maze_of(folder)
     if maze is None:
         raise record.RunError(f"{folder} has no maze to draw: only its curve can be plotted")
     arrays = record.read_frame(frame)
@@ -137,7 +137,7 @@ def overview(folders: list[Path], maps: int = 4, at: tuple[int, ...] = ()) -> Fi
         RunError: if a folder is no run or holds no such report yet.
     """
     maps = len(at) or maps
-    with_maze = [folder for folder in folders if maze_of(folder) is not None]
+    with_maze = [folder for folder in folders if record.maze_of(folder) is not None]
     if at and not with_maze:
         raise record.RunError("--at chooses maps, and these runs have no maze to draw")
     rows = len(with_maze)

@@ -13,9 +13,8 @@ from goalgan_bt.coverage import attempts
 from goalgan_bt.envs.batch import MujocoEnv
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.policy import GaussianPolicy
-from goalgan_bt.record import RunError
+from goalgan_bt.record import RunError, maze_of
 from goalgan_bt.train import make_env
-from goalgan_bt.viz.run import maze_of
 
 
 @dataclass(frozen=True)

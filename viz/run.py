@@ -14,30 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from goalgan_bt import record
-from goalgan_bt.envs.maze import FloatArray, Maze
+from goalgan_bt.envs.maze import FloatArray
 from goalgan_bt.viz.metrics import Metrics
 
 Frame = dict[str, NDArray[Any]]
 REMEMBERED = 64  # frames kept in memory
-
-
-def maze_of(folder: Path) -> Maze | None:
-    """The maze of a run, or None for an environment without walls.
-
-    Raises:
-        RunError: if the folder is no run.
-    """
-    meta = record.read_meta(folder)
-    try:
-        maze = meta["maze"]
-        if maze is None:
-            return None
-        side = float(maze["cell_size"])
-        if not 0 < side < 1e3:
-            raise ValueError(f"cells of {side} m")
-        return Maze(tuple(maze["rows"]), side)
-    except (KeyError, TypeError, ValueError) as error:
-        raise record.RunError(f"{folder / 'meta.json'} is damaged: {error!r}") from None
 
 
 class Run:
@@ -59,7 +40,7 @@ class Run:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.name = folder, folder.resolve().name
-        self.maze = maze_of(folder)
+        self.maze = record.maze_of(folder)
         try:
             settings = json.loads((folder / "config.json").read_text())
             self.env, self.settings = str(settings["env"]), dict(settings)
