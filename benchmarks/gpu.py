@@ -26,8 +26,8 @@ from goalgan_bt.config import Config
 from goalgan_bt.coverage import coverage as both_policies
 from goalgan_bt.envs.device import DeviceEpisodes
 from goalgan_bt.policy import GaussianPolicy
-from goalgan_bt.train import make_env
 from goalgan_bt.record import maze_of
+from goalgan_bt.train import make_env
 
 HORIZONS = (1, 10, 50)  # steps after which errors are taken
 STATES = 256  # simulations whose errors are taken
