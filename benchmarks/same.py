@@ -29,7 +29,8 @@ import tyro
 ROOT = Path(__file__).parents[1]
 TINY = (
     "--rollout.num-envs 32 --rollout.steps 40 --horizon 120 --backtracking.min-transitions 200 "
-    "--coverage.rollouts 1 --coverage.every 3000 --gan.steps 20 --threads 1 --viz none "
+    "--coverage.rollouts 1 --coverage.every 3000 --gan.steps 20 --imitation.fade 2 --threads 1 "
+    "--viz none "
 )
 POINT = f"--env point_umaze {TINY} --iterations 4 --goals.near 1"
 ROOMS = "--env four_rooms_11 --total-steps 30000"
