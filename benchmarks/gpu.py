@@ -20,14 +20,13 @@ import mujoco
 import numpy as np
 import torch
 import tyro
+from device_episodes import DeviceEpisodes
 
-from goalgan_bt import checkpoint, config
-from goalgan_bt.config import Config
-from goalgan_bt.coverage import coverage as both_policies
-from goalgan_bt.envs.device import DeviceEpisodes
-from goalgan_bt.policy import GaussianPolicy
-from goalgan_bt.record import maze_of
-from goalgan_bt.train import make_env
+from goalgan_bt.agent.coverage import coverage as both_policies
+from goalgan_bt.agent.policy import GaussianPolicy
+from goalgan_bt.learners import maze_config, maze_learner, table
+from goalgan_bt.learners.maze_config import MazeConfig, make_env
+from goalgan_bt.runs.run_folder import maze_of
 
 HORIZONS = (1, 10, 50)  # steps after which errors are taken
 STATES = 256  # simulations whose errors are taken
@@ -51,7 +50,7 @@ class Settings:
     """Also write the rows to this file."""
 
 
-def speed(act: Callable[[], None], cfg: Config, num_envs: int, seconds: float) -> float:
+def speed(act: Callable[[], None], cfg: MazeConfig, num_envs: int, seconds: float) -> float:
     """Steps/s of doing something over and over, after a warm-up."""
 
     def wait() -> None:
@@ -70,7 +69,7 @@ def speed(act: Callable[[], None], cfg: Config, num_envs: int, seconds: float) -
     return actions * cfg.action_repeat * num_envs / (time.perf_counter() - begin)
 
 
-def warp(cfg: Config, num_envs: int, seconds: float) -> float:
+def warp(cfg: MazeConfig, num_envs: int, seconds: float) -> float:
     """Steps/s of mujoco-warp alone: random controls, back to the start every 100 steps."""
     episodes = DeviceEpisodes(make_env(cfg, num_envs))
     batch, ctrl = episodes.env.batch, episodes.env.batch.bind("ctrl")
@@ -90,7 +89,7 @@ def warp(cfg: Config, num_envs: int, seconds: float) -> float:
 
 
 @torch.inference_mode()
-def warp_policy(cfg: Config, num_envs: int, seconds: float) -> float:
+def warp_policy(cfg: MazeConfig, num_envs: int, seconds: float) -> float:
     """Steps/s of episodes of a fresh policy, each to a goal anywhere in the maze."""
     env = make_env(cfg, num_envs)
     episodes = DeviceEpisodes(env)
@@ -117,7 +116,7 @@ def warp_policy(cfg: Config, num_envs: int, seconds: float) -> float:
     return speed(act, cfg, num_envs, seconds)
 
 
-def errors(cfg: Config) -> list[dict[str, Any]]:
+def errors(cfg: MazeConfig) -> list[dict[str, Any]]:
     """How far the torsos are apart after steps of random controls, from states in motion."""
     cfg = replace(cfg, action_repeat=1)
     cpu, gpu = (
@@ -149,14 +148,14 @@ def errors(cfg: Config) -> list[dict[str, Any]]:
 
 def coverage(run: Path, device: str) -> list[dict[str, Any]]:
     """Coverage of a run's policy under MuJoCo and under mujoco-warp, stochastic and by its mean."""
-    cfg, maze = config.load(run), maze_of(run)
+    cfg, maze = table.load(run), maze_of(run)
     rows = []
     for physics, where in (("mujoco", "auto"), ("warp", device)):
         cfg = replace(cfg, physics=physics, device=where)
         test_goals = make_env(cfg, 1, maze).test_goals()
         env = make_env(cfg, len(test_goals) * (cfg.coverage.rollouts + 1), maze)
         policy = GaussianPolicy(env.obs_dim, env.act_dim, cfg.policy)
-        checkpoint.load_policy(policy, run)
+        maze_learner.load_policy(policy, run)
         noise = torch.Generator().manual_seed(0)
         found = both_policies(env, policy, test_goals, cfg.coverage.rollouts, noise)
         row = {"name": "coverage", "env": cfg.env, "physics": physics, "run": run.name}
@@ -168,7 +167,7 @@ def coverage(run: Path, device: str) -> list[dict[str, Any]]:
 
 def main() -> None:
     settings = tyro.cli(Settings, description=__doc__)
-    torch.set_num_threads(config.ANT.learning_threads)  # as in training
+    torch.set_num_threads(maze_config.ANT.learning_threads)  # as in training
     gpu = settings.device.startswith("cuda")
     machine = torch.cuda.get_device_name(settings.device) if gpu else "CPU"
     print(f"{machine}, mujoco {mujoco.__version__}, torch {torch.__version__}")
@@ -179,7 +178,7 @@ def main() -> None:
         print("  ".join(f"{key} {value}" for key, value in row.items()), flush=True)
 
     for env in settings.env:
-        cfg = replace(config.preset(env), physics="warp", device=settings.device)
+        cfg = replace(maze_config.preset(env), physics="warp", device=settings.device)
         where = {"env": env, "device": settings.device, "machine": machine}
         for row in errors(cfg):
             add(row | where)

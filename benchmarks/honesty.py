@@ -17,14 +17,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from goalgan_bt import checkpoint, config
-from goalgan_bt.command_line import UsageError, parse
-from goalgan_bt.coverage import coverage
-from goalgan_bt.envs.batch import GoalEnv
-from goalgan_bt.policy import Actor, GaussianPolicy
-from goalgan_bt.progress import complain
-from goalgan_bt.record import RunError
-from goalgan_bt.train import TEST_ENVS, make_env
+from goalgan_bt.agent.coverage import coverage
+from goalgan_bt.agent.policy import Actor, GaussianPolicy
+from goalgan_bt.envs.goal_env import GoalEnv
+from goalgan_bt.learners import maze_config, maze_learner, table
+from goalgan_bt.learners.maze import TEST_ENVS
+from goalgan_bt.learners.maze_config import make_env
+from goalgan_bt.runs.command_line import parse
+from goalgan_bt.runs.errors import RunError, UsageError
+from goalgan_bt.runs.terminal import complain
 
 START = (3, 1)  # in their map
 CELLS = [(3, 2), (3, 3), (2, 3), (1, 3), (1, 2), (1, 1)]  # the other free ones
@@ -46,16 +47,16 @@ class Settings:
     """Where to write the rows."""
 
 
-def learned(cfg: config.Config, env: GoalEnv, folder: Path) -> GaussianPolicy:
+def learned(cfg: maze_config.MazeConfig, env: GoalEnv, folder: Path) -> GaussianPolicy:
     """The policy of a run."""
     policy = GaussianPolicy(env.obs_dim, env.act_dim, cfg.policy)
-    checkpoint.load_policy(policy, folder)
+    maze_learner.load_policy(policy, folder)
     return policy
 
 
 def integrators(folder: Path, rollouts: int) -> dict[str, float]:
     """Coverage of a run's policy under each integrator."""
-    cfg, found = config.load(folder), {}
+    cfg, found = table.load(folder), {}
     for integrator in ("implicitfast", "rk4"):
         env = make_env(replace(cfg, integrator=integrator), TEST_ENVS)
         noise = torch.Generator().manual_seed(cfg.seed)
@@ -71,7 +72,7 @@ def in_gymnasium(folder: Path, episodes: int) -> dict[str, float]:
     import gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)
-    cfg = config.load(folder)
+    cfg = table.load(folder)
     ours = make_env(cfg, 1)
     theirs = gymnasium.make("PointMaze_UMaze-v3", continuing_task=False)
     act, successes = Actor(learned(cfg, ours, folder)), np.zeros((len(CELLS), episodes))

@@ -24,7 +24,9 @@ import viser
 import websockets.sync.client
 from viser import _messages
 
-from goalgan_bt import record
+from goalgan_bt.runs.frames import frame_paths, read_frame
+from goalgan_bt.runs.metrics_csv import read_metrics
+from goalgan_bt.runs.run_writer import RunWriter
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ def steps_per_second(cfg: PageConfig, visitors: int, out: Path) -> float:
     if page is not None:
         page.kill()
         page.wait()
-    _, rows = record.read_metrics(folder)
+    _, rows = read_metrics(folder)
     steps = np.array([float(row["steps/train"]) for row in rows])
     seconds = np.array([float(row["time/total"]) for row in rows])
     late = seconds > seconds[-1] - cfg.seconds
@@ -115,11 +117,11 @@ def memory(cfg: PageConfig, out: Path) -> list[float]:
     words += ["--out", str(out), "--iterations", "2", "--report-every", "1"]
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     folder = Path(done.stdout.splitlines()[0].removeprefix("run folder: "))
-    frame = record.read_frame(record.frames(folder)[-1])
-    _, (_, row) = record.read_metrics(folder)
+    frame = read_frame(frame_paths(folder)[-1])
+    _, (_, row) = read_metrics(folder)
     values = {name: float(text) for name, text in row.items() if text}
     page = serve(folder, 1)
-    records, sizes = record.Record(folder, 2), []
+    records, sizes = RunWriter(folder, 2), []
     for i in range(cfg.reports):
         values |= {"iteration": i + 3, "steps/train": values["steps/train"] + 12_800}
         records.metrics(values)

@@ -25,54 +25,54 @@ from typing import Any
 import tyro
 from common import machine
 
-from goalgan_bt import config
-from goalgan_bt.config import Config
-from goalgan_bt.train import Trained, train
+from goalgan_bt.learners import maze_config
+from goalgan_bt.learners.maze import Trained, train
+from goalgan_bt.learners.maze_config import MazeConfig
 
 # Functions by phase, as they are looked up when they are called: a function that another module
 # has imported by name is wrapped there.
 PHASES = {
     "simulation": (
-        "goalgan_bt.envs.batch:MujocoEnv.advance",
+        "goalgan_bt.envs.mujoco_env:MujocoEnv.advance",
         "goalgan_bt.envs.point_maze:PointMaze.advance",
         "goalgan_bt.envs.point_nd:PointND.advance",
     ),
     "observation": (
-        "goalgan_bt.envs.batch:GoalEnv.observe",
+        "goalgan_bt.envs.goal_env:GoalEnv.observe",
         "goalgan_bt.envs.ant_maze:AntMaze.observations",
         "goalgan_bt.envs.ant_maze:AntMaze.achieved_goals",
         "goalgan_bt.envs.ant_maze:AntMaze.to_body",
         "goalgan_bt.envs.point_maze:PointMaze.observations",
         "goalgan_bt.envs.point_nd:PointND.observations",
     ),
-    "policy inference": ("goalgan_bt.policy:Actor.__call__",),
-    "bookkeeping of rollouts": ("goalgan_bt.rollout:Collector.collect",),
-    "advantages": ("goalgan_bt.train:advantages_and_returns",),
-    "TRPO": ("goalgan_bt.trpo:update",),
-    "value function": ("goalgan_bt.policy:ValueFunction.fit",),
-    "backtracking model": ("goalgan_bt.backtracking:BacktrackingModel.fit",),
-    "GAN": ("goalgan_bt.gan:GoalGAN.fit", "goalgan_bt.gan:GoalGAN.sample"),
+    "policy inference": ("goalgan_bt.agent.policy:Actor.__call__",),
+    "bookkeeping of rollouts": ("goalgan_bt.agent.rollout:Collector.collect",),
+    "advantages": ("goalgan_bt.learners.maze:advantages_and_returns",),
+    "TRPO": ("goalgan_bt.agent.trpo:update",),
+    "value function": ("goalgan_bt.agent.policy:ValueFunction.fit",),
+    "backtracking model": ("goalgan_bt.recall.backtracking:BacktrackingModel.fit",),
+    "GAN": ("goalgan_bt.curriculum.gan:GoalGAN.fit", "goalgan_bt.curriculum.gan:GoalGAN.sample"),
     "labels": (
-        "goalgan_bt.learner:Learner.remember",
-        "goalgan_bt.learner:Learner.intermediate",
-        "goalgan_bt.goals:SuccessEstimator.__call__",
-        "goalgan_bt.goals:GoalMemory.add",
+        "goalgan_bt.learners.maze_learner:MazeLearner.remember",
+        "goalgan_bt.curriculum.curriculum:GoalCurriculum.judge",
+        "goalgan_bt.curriculum.goals:SuccessEstimator.__call__",
+        "goalgan_bt.curriculum.goals:GoalMemory.add",
     ),
     "decoder and recall traces": (
-        "goalgan_bt.train:decode",
-        "goalgan_bt.train:recall_traces",
-        "goalgan_bt.backtracking:Steps.lesson",
+        "goalgan_bt.learners.maze:decode",
+        "goalgan_bt.learners.maze:recall_traces",
+        "goalgan_bt.recall.transitions:Steps.lesson",
     ),
-    "imitation": ("goalgan_bt.imitation:Imitation.update",),
-    "evaluation": ("goalgan_bt.train:coverage", "goalgan_bt.train:consistency"),
+    "imitation": ("goalgan_bt.recall.imitation:Imitation.update",),
+    "evaluation": ("goalgan_bt.learners.maze:coverage", "goalgan_bt.learners.maze:consistency"),
     "recording": (
-        "goalgan_bt.record:Record.metrics",
-        "goalgan_bt.record:Record.frame",
-        "goalgan_bt.backtracking:RecallTraces.paths",
-        "goalgan_bt.learner:Learner.estimated_success",
-        "goalgan_bt.progress:Progress.report",
+        "goalgan_bt.runs.run_writer:RunWriter.metrics",
+        "goalgan_bt.runs.run_writer:RunWriter.frame",
+        "goalgan_bt.recall.traces:Traces.paths",
+        "goalgan_bt.curriculum.curriculum:GoalCurriculum.mapped",
+        "goalgan_bt.runs.terminal:Terminal.report",
     ),
-    "checkpoint": ("goalgan_bt.checkpoint:save",),
+    "checkpoint": ("goalgan_bt.runs.checkpoint:save",),
     "waiting for the second thread": ("concurrent.futures:Future.result",),
 }
 WHOLE = set(PHASES) - {"bookkeeping of rollouts"}
@@ -161,20 +161,20 @@ def wrapped(timers: Timers) -> Iterator[None]:
             setattr(owner, attribute, original)
 
 
-def quiet(cfg: Config, run: Callable[..., Any]) -> int:
+def quiet(cfg: MazeConfig, run: Callable[..., Any]) -> int:
     """Train in a folder of no importance and without a word; returns the steps."""
     silence = contextlib.redirect_stdout(io.StringIO())
     with tempfile.TemporaryDirectory() as folder, silence:
         return run(cfg, Path(folder)).steps
 
 
-def profile(cfg: Config) -> str:
+def profile(cfg: MazeConfig) -> str:
     """Train once; a table in Markdown of where the time went."""
     quiet(replace(cfg, total_steps=1), train)
     timers = Timers()
     wall = cpu = 0.0
 
-    def timed(cfg: Config, folder: Path) -> Trained:  # without what becomes of the folder
+    def timed(cfg: MazeConfig, folder: Path) -> Trained:  # without what becomes of the folder
         nonlocal wall, cpu
         wall, cpu = time.perf_counter(), time.process_time()
         trained = timers.wrap(train, REST)(cfg, folder)
@@ -206,7 +206,7 @@ def main() -> None:
     parts = [f"# Where the time of training goes\n\n{machine()}. From {words}.\n\n{notes()}\n"]
     print(parts[0], flush=True)
     for env in settings.env:
-        cfg = config.preset(env)
+        cfg = maze_config.preset(env)
         cfg = replace(cfg, threads=settings.threads, total_steps=settings.train_steps)
         parts.append(profile(cfg))
         print(parts[-1], flush=True)

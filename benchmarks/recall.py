@@ -20,10 +20,11 @@ from sb3_contrib import TRPO
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 
-from goalgan_bt.command_line import UsageError, parse
-from goalgan_bt.progress import complain
-from goalgan_bt.sb3 import RecallTraces
-from goalgan_bt.settings import RecallConfig
+from goalgan_bt.learners.stable_baselines import RecallTraces
+from goalgan_bt.recall.settings import RecallConfig
+from goalgan_bt.runs.command_line import parse
+from goalgan_bt.runs.errors import UsageError
+from goalgan_bt.runs.terminal import complain
 
 STEPS = {SAC: 6_000, PPO: 24_576, TRPO: 24_576}  # twelve turns each
 

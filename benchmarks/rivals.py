@@ -19,12 +19,11 @@ import torch
 from common import Sample, Unavailable, clocked
 from numpy.typing import NDArray
 
-from goalgan_bt.config import Config
 from goalgan_bt.envs.ant_maze import HEALTHY_Z
-from goalgan_bt.envs.batch import INTEGRATORS
 from goalgan_bt.envs.maze import Maze
+from goalgan_bt.envs.mujoco_env import INTEGRATORS
 from goalgan_bt.envs.point_maze import RADIUS
-from goalgan_bt.train import make_env
+from goalgan_bt.learners.maze_config import MazeConfig, make_env
 
 Float32 = NDArray[np.float32]
 
@@ -45,7 +44,7 @@ class SingleMaze(gymnasium.Env[Float32, Float32]):
         cfg: settings that name the environment.
     """
 
-    def __init__(self, cfg: Config) -> None:
+    def __init__(self, cfg: MazeConfig) -> None:
         ours: Any = make_env(cfg, 1)
         self._ant = cfg.env.startswith("ant")
         self._repeat, self._horizon = ours.action_repeat, ours.horizon
@@ -134,7 +133,7 @@ class Slide:
 
 
 def sb3_contrib_trpo(
-    cfg: Config, durations: Iterable[float], vector: str, num_envs: int, n_steps: int
+    cfg: MazeConfig, durations: Iterable[float], vector: str, num_envs: int, n_steps: int
 ) -> Iterator[Sample]:
     """Training by sb3-contrib's TRPO as it comes: two networks of 64-64, ten epochs of the critic.
 
@@ -172,7 +171,7 @@ def sb3_contrib_trpo(
 
 
 def gymnasium_robotics(
-    cfg: Config, durations: Iterable[float], our_physics: bool
+    cfg: MazeConfig, durations: Iterable[float], our_physics: bool
 ) -> Iterator[Sample]:
     """Random actions in gymnasium-robotics' U-maze, as `gymnasium.make` gives it: one simulation.
 
@@ -220,7 +219,7 @@ def mujoco_env(env: gymnasium.Env[Any, Any]) -> Any:
     return maze.ant_env if hasattr(maze, "ant_env") else maze.point_env
 
 
-def envpool(cfg: Config, durations: Iterable[float]) -> Iterator[Sample]:
+def envpool(cfg: MazeConfig, durations: Iterable[float]) -> Iterator[Sample]:
     """Random actions in EnvPool's Ant (five RK4 steps of 0.01 s each, no maze: it has none for the
     Ant) or PointMaze (one Euler step of 0.01 s), with as many simulations and threads as ours."""
     import envpool as package

@@ -45,11 +45,12 @@ import torch
 import tyro
 from common import Sample, Unavailable, clocked, cores, cpu_seconds, machine
 
-from goalgan_bt import config, record
-from goalgan_bt.config import Config
-from goalgan_bt.learner import Learner
-from goalgan_bt.rollout import Collector
-from goalgan_bt.train import make_env, train
+from goalgan_bt.agent.rollout import Collector
+from goalgan_bt.learners import maze_config
+from goalgan_bt.learners.maze import train
+from goalgan_bt.learners.maze_config import MazeConfig, make_env
+from goalgan_bt.learners.maze_learner import MazeLearner
+from goalgan_bt.runs.metrics_csv import read_metrics
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ class Measurement:
         return [sample.steps / sample.seconds for sample in self.taken]
 
 
-def raw_batch(cfg: Config, durations: Iterable[float]) -> Iterator[Sample]:
+def raw_batch(cfg: MazeConfig, durations: Iterable[float]) -> Iterator[Sample]:
     """The simulator alone: random controls, back to the start every 100 steps."""
     env: Any = make_env(cfg, cfg.rollout.num_envs)
     ids = np.arange(env.num_envs)
@@ -109,10 +110,10 @@ def raw_batch(cfg: Config, durations: Iterable[float]) -> Iterator[Sample]:
     return clocked(episode, durations, env.dt)
 
 
-def collection(cfg: Config, durations: Iterable[float]) -> Iterator[Sample]:
+def collection(cfg: MazeConfig, durations: Iterable[float]) -> Iterator[Sample]:
     """Rollouts with a fresh policy."""
     env = make_env(cfg, cfg.rollout.num_envs)
-    learner = Learner(env, cfg)
+    learner = MazeLearner(env, cfg)
     collector = Collector(env, cfg.rollout, learner.rng, learner.noise["rollout"])
     goals = learner.gan.sample(300)
     collector.begin(goals)
@@ -125,7 +126,7 @@ def collection(cfg: Config, durations: Iterable[float]) -> Iterator[Sample]:
     return clocked(batch, durations, env.dt)
 
 
-def training(cfg: Config, durations: Iterable[float], total_steps: int) -> Iterator[Sample]:
+def training(cfg: MazeConfig, durations: Iterable[float], total_steps: int) -> Iterator[Sample]:
     """Whole runs, from building the environment to the last evaluation; the first, as a warm-up,
     of one iteration. The durations are not heeded."""
     limits = itertools.chain([1], itertools.repeat(total_steps))
@@ -139,7 +140,9 @@ def training(cfg: Config, durations: Iterable[float], total_steps: int) -> Itera
     return clocked(run, once, make_env(cfg, 1).dt)
 
 
-def training_ranks(cfg: Config, durations: Iterable[float], total_steps: int) -> Iterator[Sample]:
+def training_ranks(
+    cfg: MazeConfig, durations: Iterable[float], total_steps: int
+) -> Iterator[Sample]:
     """Whole runs by as many processes as there are threads, of one thread each; timed from the
     moment at which they begin to train. The durations are not heeded."""
     if cfg.num_threads == 1:
@@ -157,12 +160,12 @@ def training_ranks(cfg: Config, durations: Iterable[float], total_steps: int) ->
             env = os.environ | {"OMP_NUM_THREADS": "1"}  # torchrun's choice, without its advice
             subprocess.run([sys.executable, *words], check=True, stdout=subprocess.DEVNULL, env=env)
             (folder,) = Path(out).iterdir()
-            last = record.read_metrics(folder)[1][-1]
+            last = read_metrics(folder)[1][-1]
             seconds = float(last["time/total"])
             yield Sample(int(last["steps/train"]), seconds, cpu_seconds() - cpu, 0.02)
 
 
-Kind = Callable[[Config, Iterable[float]], Iterator[Sample]]
+Kind = Callable[[MazeConfig, Iterable[float]], Iterator[Sample]]
 
 
 def as_usual(kind: Kind) -> Kind:
@@ -202,7 +205,7 @@ def measurements(settings: Settings) -> list[Measurement]:
         for threads in (1,) if one_thread else settings.threads:
             if settings.only and name not in settings.only:
                 continue
-            cfg = replace(config.preset(env), threads=threads)
+            cfg = replace(maze_config.preset(env), threads=threads)
             if settings.num_envs is not None:
                 cfg = replace(cfg, rollout=replace(cfg.rollout, num_envs=settings.num_envs))
             warm_up = min(1.0, settings.seconds)

@@ -19,9 +19,10 @@ import tyro
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from goalgan_bt import record
-from goalgan_bt.command_line import UsageError, parse
-from goalgan_bt.progress import complain, say
+from goalgan_bt.runs.command_line import parse
+from goalgan_bt.runs.errors import RunError, UsageError
+from goalgan_bt.runs.metrics_csv import read_metrics, write_table
+from goalgan_bt.runs.terminal import complain, say
 
 COLUMNS = ("env", "method", "seeds", "free", "trained", "training", "return")
 
@@ -41,7 +42,7 @@ def visits(folder: Path) -> dict[tuple[str, str], list[dict[str, np.ndarray]]]:
     found: dict[tuple[str, str], list[dict[str, np.ndarray]]] = {}
     newest = {file.parents[1]: file for file in sorted(folder.glob("*/*-s*/*/visits.npz"))}
     for place, file in newest.items():  # a run that was cut off was made again
-        _, rows = record.read_metrics(file.parent)
+        _, rows = read_metrics(file.parent)
         with np.load(file) as counts:
             run = {name: counts[name] for name in ("trained", "training")}
         run["return"] = np.array(float(rows[-1]["eval/return"]))
@@ -98,11 +99,11 @@ def main() -> int:
         found = visits(settings.runs)
         settings.out.mkdir(parents=True, exist_ok=True)
         rows = {key: row(*key, found[key]) for key in sorted(found)}
-        record.write_table(settings.out / "visits.csv", COLUMNS, list(rows.values()))
+        write_table(settings.out / "visits.csv", COLUMNS, list(rows.values()))
         picture = io.BytesIO()
         draw(found, rows).savefig(picture, dpi=110)
         (settings.out / "visits.png").write_bytes(picture.getvalue())
-    except (UsageError, record.RunError, OSError) as error:
+    except (UsageError, RunError, OSError) as error:
         complain(str(error))
         return 2
     writer = csv.DictWriter(sys.stdout, COLUMNS, lineterminator="\n")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from goalgan_bt.envs import maze as mazes
 
 if TYPE_CHECKING:
-    from goalgan_bt.envs.batch import GoalEnv
+    from goalgan_bt.envs.goal_env import GoalEnv
 
 HORIZON = {"point": 200, "ant": 500}  # steps of an episode in the U-maze
 NAMES = (*(f"{body}_{layout}" for body in HORIZON for layout in mazes.LAYOUTS), "point_nd")
@@ -54,7 +54,7 @@ def make(
         raise ValueError(f"unknown environment {name!r}: choose one of {', '.join(NAMES)}")
     # Only now: MuJoCo takes half a second to import, and `--help` needs the names only.
     from goalgan_bt.envs.ant_maze import AntMaze
-    from goalgan_bt.envs.batch import PhysicsError
+    from goalgan_bt.envs.goal_env import PhysicsError
     from goalgan_bt.envs.point_maze import PointMaze
     from goalgan_bt.envs.point_nd import PointND
 

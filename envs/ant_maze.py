@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 
 from goalgan_bt.envs.arrays import Array, columns, like, namespace
-from goalgan_bt.envs.batch import INTEGRATORS, MazeEnv, add_walls
 from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
+from goalgan_bt.envs.mujoco_env import INTEGRATORS, MazeEnv, add_walls
 
 TORSO_RADIUS = 0.25  # m
 LEG_RADIUS = 0.08  # m

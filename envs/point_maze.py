@@ -12,8 +12,9 @@ import mujoco
 import numpy as np
 
 from goalgan_bt.envs.arrays import Array, namespace, put
-from goalgan_bt.envs.batch import INTEGRATORS, Ids, MazeEnv, add_walls
+from goalgan_bt.envs.goal_env import Ids
 from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
+from goalgan_bt.envs.mujoco_env import INTEGRATORS, MazeEnv, add_walls
 
 RADIUS = 0.1  # m
 

@@ -8,7 +8,7 @@ dimensions, the fewer goals are feasible (20% in two, then 0.06 times that per d
 import numpy as np
 from numpy.typing import NDArray
 
-from goalgan_bt.envs.batch import GoalEnv, Ids
+from goalgan_bt.envs.goal_env import GoalEnv, Ids
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 
 MAX_FORCE = 2.0  # m/s^2 per axis, at action 1

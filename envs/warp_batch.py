@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from goalgan_bt.envs.batch import Ids, PhysicsError
+from goalgan_bt.envs.goal_env import Ids, PhysicsError
 from goalgan_bt.envs.maze import FloatArray
 
 # Per simulation. Ants that were thrown into corners at full force needed 15 and 63 at most.

@@ -3,21 +3,21 @@
 python -m goalgan_bt.plot runs/ant_umaze-20261122-101500-s0
 """
 
-import os
-import signal
-import sys
+from goalgan_bt.runs.signals import exit_with, leave_at_once
 
 if __name__ == "__main__":  # nothing to lose: it goes at once, without a word
-    signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+    leave_at_once()
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
-from goalgan_bt.command_line import UsageError, parse
-from goalgan_bt.progress import complain, say
-from goalgan_bt.record import RunError
+from goalgan_bt.runs.command_line import check_ranges, parse, run_command
+from goalgan_bt.runs.errors import RunError, UsageError
+from goalgan_bt.runs.ranges import ABOVE_ZERO, between
+from goalgan_bt.runs.terminal import say
 
 
 @dataclass(frozen=True)
@@ -28,34 +28,39 @@ class PlotConfig:
     """Run folders."""
     out: Path | None = None
     """PNG to write; by default curves.png in the first run folder."""
-    maps: int = 4
+    maps: Annotated[int, between(1, 50)] = 4
     """Coverage maps per run, spread over training."""
-    at: tuple[int, ...] = ()
+    at: Annotated[tuple[int, ...], ABOVE_ZERO] = ()
     """Iterations whose maps to draw instead."""
 
 
-def main() -> int:
+def main(argv: list[str] | None = None) -> int:
     """The command line; returns the exit code."""
+    return run_command(lambda: work(argv))
+
+
+def work(argv: list[str] | None) -> None:
+    """What the command line asks for.
+
+    Raises:
+        UsageError, RunError: saying what is wrong.
+    """
+    cfg = parse(PlotConfig, argv, "python -m goalgan_bt.plot")
+    check_ranges(cfg)
+    if not cfg.runs:
+        raise UsageError("name at least one run folder: python -m goalgan_bt.plot RUN")
+    if len(cfg.at) > 50:
+        raise UsageError("--at takes at most 50 iterations")
+    if cfg.out is not None and cfg.out.suffix != ".png":
+        raise UsageError(f"cannot write '{cfg.out}': its name must end in .png")
     try:
-        cfg = parse(PlotConfig, None, "python -m goalgan_bt.plot")
-        if not cfg.runs or not 1 <= cfg.maps <= 50:
-            raise UsageError("name at least one run folder, and ask for 1 to 50 maps")
-        if len(cfg.at) > 50 or min(cfg.at, default=1) < 1:
-            raise UsageError("--at takes 1 to 50 iterations, each 1 or more")
-        if cfg.out is not None and cfg.out.suffix != ".png":
-            raise UsageError(f"cannot write '{cfg.out}': its name must end in .png")
-        try:
-            from goalgan_bt.viz import pictures
-        except ImportError:
-            raise RunError('plots need matplotlib: pip install "goalgan_bt[plots]"') from None
-        path = cfg.out or cfg.runs[0] / "curves.png"
-        pictures.overview(list(cfg.runs), cfg.maps, cfg.at).savefig(path, dpi=150)
-    except (RunError, OSError, ValueError) as error:
-        complain(str(error))
-        return 2
+        from goalgan_bt.viz import pictures
+    except ImportError:
+        raise RunError('plots need matplotlib: pip install "goalgan_bt[plots]"') from None
+    path = cfg.out or cfg.runs[0] / "curves.png"
+    pictures.overview(list(cfg.runs), cfg.maps, cfg.at).savefig(path, dpi=150)
     say(str(path))
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    exit_with(main())

@@ -7,9 +7,10 @@ import sys
 import pytest
 import torch
 
-from goalgan_bt import config, record
 from goalgan_bt.envs import maze as mazes
-from goalgan_bt.train import train
+from goalgan_bt.learners import table
+from goalgan_bt.learners.maze import train
+from goalgan_bt.runs import run_folder
 
 # Many small networks: threads would only wait for each other.
 torch.set_num_threads(1)
@@ -39,8 +40,8 @@ def trained(tmp_path_factory):
     """A finished run of four iterations; not to be changed."""
     folder = tmp_path_factory.mktemp("runs") / "point_umaze-test-s0"
     folder.mkdir()
-    record.write_meta(folder, mazes.layout("umaze"))
-    train(config.from_command_line(TINY.split()), folder)
+    run_folder.write_meta(folder, mazes.layout("umaze"))
+    train(table.from_command_line(TINY.split()), folder)
     return folder
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from goalgan_bt.advantage import gae
+from goalgan_bt.agent.advantage import gae
 
 
 def run(rewards, values, next_values, terminated=(0, 0, 0), truncated=(0, 0, 0), lam=0.5):

@@ -1,17 +1,18 @@
 import json
+from dataclasses import asdict
 
 import pytest
 
-from goalgan_bt import config, envs
-from goalgan_bt.command_line import UsageError
-from goalgan_bt.config import ConfigError
-from goalgan_bt.record import RunError
+from goalgan_bt import envs
+from goalgan_bt.learners import maze_config, table
+from goalgan_bt.runs.errors import RunError, UsageError
+from goalgan_bt.runs.run_folder import write_settings
 
 
 @pytest.mark.parametrize("name", envs.NAMES)
 def test_every_environment_has_a_preset_that_can_be_run(name):
-    cfg = config.preset(name)
-    config.check(cfg)
+    cfg = maze_config.preset(name)
+    table.check(cfg)
     assert cfg.env == name
     assert cfg.backtracking.trace_length == (50 if name.startswith("ant") else 20)
 
@@ -19,9 +20,9 @@ def test_every_environment_has_a_preset_that_can_be_run(name):
 @pytest.mark.parametrize("env", ["point_umaze", "ant_umaze"])
 def test_the_command_line_overrides_the_preset(env):
     flags = ["--backtracking.trace-length", "7", f"--env={env}", "--trpo.max-kl", "0.5"]
-    cfg = config.from_command_line(flags)
+    cfg = table.from_command_line(flags)
     assert (cfg.env, cfg.backtracking.trace_length, cfg.trpo.max_kl) == (env, 7, 0.5)
-    assert cfg.total_steps == config.preset(env).total_steps
+    assert cfg.total_steps == maze_config.preset(env).total_steps
 
 
 @pytest.mark.parametrize(
@@ -45,7 +46,7 @@ def test_the_command_line_overrides_the_preset(env):
         (["--backtracking.min-transitions", "0"], "greater than 0"),
         (["--backtracking.buffer", "10"], "--backtracking.min-transitions must not be more"),
         (["--seed", "99999999999999999999999"], "--seed must be a sane number"),
-        (["--rollout.num-envs", "1000000000"], "--rollout.num-envs must be at most"),
+        (["--rollout.num-envs", "1000000000"], "--rollout.num-envs must be between 1 and 100000"),
         (["--threads", "100000000"], "--threads must be at most"),
         (["--trpo.max-kl", "inf"], "--trpo.max-kl must be finite"),
         (["--goals.neighbours", "0"], "greater than 0"),
@@ -58,27 +59,28 @@ def test_the_command_line_overrides_the_preset(env):
 )
 def test_bad_flags_are_one_clear_line(flags, message):
     with pytest.raises((UsageError, RunError)) as error:
-        config.from_command_line(flags)
+        table.from_command_line(flags)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
 def test_settings_survive_the_run_folder(tmp_path):
-    cfg = config.from_command_line(
+    cfg = table.from_command_line(
         ["--env", "point_umaze", "--policy.hidden", "8", "9", "--out", "x"]
     )
-    config.save(cfg, tmp_path)
-    assert config.load(tmp_path) == cfg
+    write_settings(tmp_path, asdict(cfg))
+    assert table.load(tmp_path) == cfg
 
 
 def test_resume_starts_from_the_runs_settings(tmp_path):
-    config.save(config.from_command_line(["--env", "point_spiral", "--seed", "3"]), tmp_path)
-    cfg = config.from_command_line(["--resume", str(tmp_path), "--iterations", "9"])
+    cfg = table.from_command_line(["--env", "point_spiral", "--seed", "3"])
+    write_settings(tmp_path, asdict(cfg))
+    cfg = table.from_command_line(["--resume", str(tmp_path), "--iterations", "9"])
     assert (cfg.env, cfg.seed, cfg.iterations) == ("point_spiral", 3, 9)
-    with pytest.raises(ConfigError, match="--env of a run cannot change"):
-        config.from_command_line(["--resume", str(tmp_path), "--env", "ant_umaze"])
-    with pytest.raises(ConfigError, match="--env of a run cannot change"):
-        config.from_command_line(["--resume", str(tmp_path), "--env", "hopper"])
+    with pytest.raises(UsageError, match="--env of a run cannot change"):
+        table.from_command_line(["--resume", str(tmp_path), "--env", "ant_umaze"])
+    with pytest.raises(UsageError, match="--env of a run cannot change"):
+        table.from_command_line(["--resume", str(tmp_path), "--env", "hopper"])
 
 
 @pytest.mark.parametrize(
@@ -95,18 +97,18 @@ def test_resume_starts_from_the_runs_settings(tmp_path):
 )
 def test_damaged_settings_are_refused(tmp_path, text):
     (tmp_path / "config.json").write_text(text)
-    with pytest.raises((ConfigError, RunError)) as error:
-        config.load(tmp_path)
+    with pytest.raises((UsageError, RunError)) as error:
+        table.load(tmp_path)
     assert "\n" not in str(error.value)
 
 
 def test_help_explains_every_setting(capsys):
     with pytest.raises(SystemExit) as stop:
-        config.from_command_line(["--help"])
+        table.from_command_line(["--help"])
     assert stop.value.code == 0
     text = capsys.readouterr().out
     assert "--backtracking.trace-length" in text and "--rollout.chain" in text
-    settings = json.loads(json.dumps(config.asdict(config.ANT), default=str))
+    settings = json.loads(json.dumps(asdict(maze_config.ANT), default=str))
     for name, value in settings.items():
         flags = value if isinstance(value, dict) else {"": None}
         for flag in flags:

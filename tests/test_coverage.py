@@ -2,8 +2,9 @@ import numpy as np
 import torch
 
 from goalgan_bt import envs
-from goalgan_bt.coverage import coverage, success_rate
-from goalgan_bt.policy import GaussianPolicy, PolicyConfig
+from goalgan_bt.agent.coverage import coverage, success_rate
+from goalgan_bt.agent.policy import GaussianPolicy
+from goalgan_bt.agent.settings import PolicyConfig
 
 
 def motionless(env):

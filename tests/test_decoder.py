@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from goalgan_bt import envs
-from goalgan_bt.decoder import decode
+from goalgan_bt.recall.decoder import decode
 
 
 def walked(name):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import run_module
 
-from goalgan_bt import record
+from goalgan_bt.runs import run_folder
 from goalgan_bt.viz.export import export
 from goalgan_bt.viz.run import Run
 
@@ -101,7 +101,7 @@ def test_a_run_without_a_report_or_a_maze_is_refused(folder, tmp_path):
 
 
 def test_a_run_without_walls_is_exported_too(folder, tmp_path):
-    record.write_meta(folder, None)
+    run_folder.write_meta(folder, None)
     export(Run(folder), tmp_path / "run.html")
     assert len(island(tmp_path / "run.html")["reports"]) == 8
     done = run_module("viz", folder, "--movie", tmp_path / "map.gif")

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from goalgan_bt import config, envs
-from goalgan_bt.backtracking import Transitions
-from goalgan_bt.forward import ForwardModel, imagine
-from goalgan_bt.learner import Learner
-from goalgan_bt.settings import BacktrackingConfig
+from goalgan_bt import envs
+from goalgan_bt.learners import maze_config
+from goalgan_bt.learners.maze_learner import MazeLearner
+from goalgan_bt.recall.forward import ForwardModel, imagine
+from goalgan_bt.recall.settings import BacktrackingConfig
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -21,10 +21,7 @@ def test_it_recovers_a_linear_system(seed):
     following = states + 0.5 * actions + rng.normal(0, 0.1, states.shape).astype(np.float32)
     cfg = BacktrackingConfig(steps=2000, batch=256, min_transitions=1)
     model = ForwardModel(3, 3, cfg, torch.Generator().manual_seed(0))
-    data = Transitions(3, 3, 2, cfg)
-    assert model.fit(data) == {}
-    data.add(states, actions, following, np.zeros((5000, 2)), np.zeros(5000))
-    assert set(model.fit(data)) == {"forward_nll"}
+    assert set(model.fit(states, actions, following)) == {"forward_nll"}
     s, a = torch.randn(3000, 3), 2 * torch.rand(3000, 3) - 1
     error = model.successors(s, a) - (s + 0.5 * a)
     assert error.mean(dim=0).abs().max() < 0.03
@@ -46,7 +43,7 @@ class Perfect:
 
 def test_only_imagined_successes_are_kept():
     env = envs.make("point_umaze", 200, threads=1)
-    policy = Learner(env, config.preset("point_umaze")).policy
+    policy = MazeLearner(env, maze_config.preset("point_umaze")).policy
     rng = np.random.default_rng(0)
     goals = rng.uniform(-0.6, 0.6, (200, 2))
     states = np.zeros((200, 4))

@@ -3,7 +3,8 @@ import pytest
 import torch
 from test_mlp import by_torch
 
-from goalgan_bt.gan import GanConfig, GoalGAN
+from goalgan_bt.curriculum.gan import GoalGAN
+from goalgan_bt.curriculum.settings import GanConfig
 
 LOW, HIGH = np.array([-3.0, -3.0]), np.array([7.0, 7.0])
 

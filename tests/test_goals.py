@@ -2,10 +2,11 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from goalgan_bt import config
-from goalgan_bt.goals import GoalMemory, GoalsConfig, SuccessEstimator, intermediate
-from goalgan_bt.learner import Learner
-from goalgan_bt.train import make_env
+from goalgan_bt.curriculum.goals import GoalMemory, SuccessEstimator, intermediate
+from goalgan_bt.curriculum.settings import GoalsConfig
+from goalgan_bt.learners import maze_config
+from goalgan_bt.learners.maze_config import make_env
+from goalgan_bt.learners.maze_learner import MazeLearner
 
 
 def test_label_edges_are_strict():
@@ -88,8 +89,8 @@ def test_an_estimator_without_episodes_knows_nothing():
 
 
 def test_only_goals_near_visited_places_are_intermediate():
-    cfg = config.preset("ant_umaze")
-    learner = Learner(make_env(cfg, 1), cfg)
+    cfg = maze_config.preset("ant_umaze")
+    learner = MazeLearner(make_env(cfg, 1), cfg)
     learner.visited.add(np.array([[0.0, 0.0]]))
     near, far = cfg.goals.near * 0.9, cfg.goals.near * 1.1
     goals = np.array([[near, 0.0], [far, 0.0], [near, 0.0]])

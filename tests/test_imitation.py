@@ -1,9 +1,11 @@
 import pytest
 import torch
-from test_mlp import by_torch
+from test_networks import by_torch
 
-from goalgan_bt.imitation import Imitation, ImitationConfig
-from goalgan_bt.policy import GaussianPolicy, PolicyConfig, log_prob, mean_kl
+from goalgan_bt.agent.policy import GaussianPolicy, log_prob, mean_kl
+from goalgan_bt.agent.settings import PolicyConfig
+from goalgan_bt.recall.imitation import Imitation
+from goalgan_bt.recall.settings import ImitationConfig
 
 
 def make(**settings):

@@ -2,14 +2,15 @@
 
 import pytest
 
-from goalgan_bt import config, record
-from goalgan_bt.train import train
+from goalgan_bt.learners import table
+from goalgan_bt.learners.maze import train
+from goalgan_bt.runs.metrics_csv import read_metrics
 
 
 def learn(folder, *flags):
     folder.mkdir()
-    train(config.from_command_line([*flags]), folder)
-    _, rows = record.read_metrics(folder)
+    train(table.from_command_line([*flags]), folder)
+    _, rows = read_metrics(folder)
     return [float(row["eval/coverage"]) for row in rows if row["eval/coverage"]]
 
 

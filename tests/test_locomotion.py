@@ -12,8 +12,18 @@ import pytest
 import torch
 from conftest import run_module
 
-from goalgan_bt import checkpoint, locomotion, record
-from goalgan_bt.command_line import UsageError
+from goalgan_bt import train
+from goalgan_bt.learners import locomotion, table
+from goalgan_bt.runs import checkpoint, run_folder
+from goalgan_bt.runs.errors import RunError, UsageError
+
+
+def done(iteration, tested, trained, seconds, value):
+    """Of a checkpoint what is not the agent's."""
+    steps = {"train": trained, "label": 0, "eval": tested}
+    run = {"iteration": iteration, "steps": steps, "seconds": seconds, "next_measurement": 0.0}
+    return {"run": run, "return": value}
+
 
 SHORT = "--backtracking.min-steps", 20, "--backtracking.every", 100, "--episodes", 1
 
@@ -24,10 +34,10 @@ def test_presets_are_the_papers():
     assert locomotion.preset("humanoid", "sac").backtracking.trace_length == 50
     for cfg in (locomotion.preset("ant", method) for method in ("trpo", "sac")):
         assert cfg.backtracking.fade_steps == cfg.total_steps // 2  # this is ours
-    asked = locomotion.from_command_line(["--env", "ant", "--method", "sac"])
+    asked = table.from_command_line(["--env", "ant", "--method", "sac"])
     assert (asked.num_envs, asked.total_steps, asked.backtracking.trace_length) == (1, 200_000, 50)
     with pytest.raises(UsageError, match="trpo or sac"):
-        locomotion.from_command_line(["--env", "ant", "--method", "a2c"])
+        table.from_command_line(["--env", "ant", "--method", "a2c"])
 
 
 @pytest.mark.parametrize(("method", "steps"), [("trpo", 5000), ("sac", 400)])
@@ -88,7 +98,7 @@ def test_a_run_that_is_stopped_goes_on(method, tmp_path):
     assert counts[-1] >= steps and (folder / "policy.pt").exists()
     assert not (folder / "checkpoint.pt").exists()
     again = run_module("train", "--resume", folder)
-    assert again.returncode == 2 and "is finished: there is nothing left to do" in again.stderr
+    assert again.returncode == 2 and "has reached its limits" in again.stderr
 
 
 @pytest.mark.parametrize("method", ["trpo", "sac"])
@@ -131,12 +141,12 @@ def test_a_run_cut_off_between_its_last_measurement_and_its_end_only_ends(tmp_pa
     pytest.importorskip("sb3_contrib")
     cfg = replace(locomotion.preset("hopper", "trpo"), total_steps=4096)
     cfg = replace(cfg, backtracking=replace(cfg.backtracking, trace_length=0))
-    folder = record.new_run(tmp_path, "hopper", 0, asdict(cfg))
+    folder = run_folder.new_run(tmp_path, "hopper", 0, asdict(cfg))
     agent, _ = locomotion.make(cfg)
     agent.learn(4096)
-    state = {"done": (25, 100, 1.0, 7.5)} | locomotion.state_dict(agent, None)
+    state = done(25, 100, 4096, 1.0, 7.5) | locomotion.state_dict(agent, None)
     checkpoint.save(state, folder / "checkpoint.pt")
-    assert locomotion.train(replace(cfg, resume=folder), folder) == 7.5
+    assert locomotion.train(replace(cfg, resume=folder), folder).value == 7.5
     saved = torch.load(folder / "policy.pt", weights_only=True)
     seen = agent.get_vec_normalize_env().obs_rms
     np.testing.assert_array_equal(saved["mean"], seen.mean)
@@ -151,18 +161,18 @@ def test_a_run_cut_off_between_its_last_measurement_and_its_end_only_ends(tmp_pa
 )
 def test_damaged_settings_are_refused(change, tmp_path):
     cfg = asdict(locomotion.preset("hopper", "sac"))
-    record.write_settings(tmp_path, cfg)
-    assert locomotion.load(tmp_path) == locomotion.preset("hopper", "sac")
-    record.write_settings(tmp_path, cfg | change)
-    with pytest.raises(record.RunError, match=r"cannot read .*config.json"):
-        locomotion.load(tmp_path)
+    run_folder.write_settings(tmp_path, cfg)
+    assert table.load(tmp_path) == locomotion.preset("hopper", "sac")
+    run_folder.write_settings(tmp_path, cfg | change)
+    with pytest.raises(RunError, match=r"cannot read .*config.json"):
+        table.load(tmp_path)
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        {"done": ("a", 1, 2, 3)},
-        {"done": (1, 5, np.nan, 2.0)},
+        {"return": "a"},
+        done(1, 5, 10, np.nan, 2.0),
         {"log_ent_coef": torch.tensor([np.nan])},
         {"parameters": "nan"},
         {"steps": "many"},
@@ -175,7 +185,7 @@ def test_a_checkpoint_that_says_nonsense_is_refused(change, tmp_path):
     cfg = locomotion.preset("hopper", "sac")
     agent, _ = locomotion.make(cfg)
     agent.learn(10)
-    state = {"done": (1, 5, 1.0, 2.0)} | locomotion.state_dict(agent, None)
+    state = done(1, 5, 10, 1.0, 2.0) | locomotion.state_dict(agent, None)
     if change == {"replay": "past"}:
         change = {"replay": state["replay"] | {"pos": 10**7}}
     if change == {"parameters": "nan"}:
@@ -184,9 +194,9 @@ def test_a_checkpoint_that_says_nonsense_is_refused(change, tmp_path):
     for told, good in ((state, True), (state | change, False)):
         checkpoint.save(told, tmp_path / "checkpoint.pt")
         if good:
-            assert locomotion.resume(agent, None, tmp_path) == (1, 5, 1.0, 2.0)
+            assert locomotion.resume(agent, None, tmp_path) == (state["run"], 2.0)
         else:
-            with pytest.raises(record.RunError, match="it is damaged"):
+            with pytest.raises(RunError, match="it is damaged"):
                 locomotion.resume(agent, None, tmp_path)
 
 
@@ -194,8 +204,7 @@ def test_a_checkpoint_that_says_nonsense_is_refused(change, tmp_path):
 def test_without_the_agents_there_is_no_run_folder(package, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, package, None)
     flags = "--env", "hopper", "--out", str(tmp_path / "runs")
-    monkeypatch.setattr(sys, "argv", ["train", *flags])
-    assert locomotion.main() == 2 and not (tmp_path / "runs").exists()
+    assert train.main(list(flags)) == 2 and not (tmp_path / "runs").exists()
     said = capsys.readouterr().err
     assert said == f'error: locomotion needs {package}: pip install "goalgan_bt[sb3]"\n'
 
@@ -213,7 +222,7 @@ def test_without_traces_nothing_is_recalled(tmp_path):
     ("flags", "words"),
     [
         (["--total-steps", "0"], "--total-steps must be"),
-        (["--backtracking.trace-length", "-1"], "trace_length must be finite and greater"),
+        (["--backtracking.trace-length", "-1"], "--backtracking.trace-length must be 0 or more"),
         (["--method", "ppo"], "choose trpo or sac"),
         (["--speed", "9"], "--speed"),
     ],
@@ -233,7 +242,7 @@ def test_a_signal_after_the_last_line_changes_nothing(number, tmp_path):
         stderr=subprocess.PIPE,
         text=True,
     ) as running:
-        while " at the end of training" not in running.stdout.readline():
+        while " training steps: " not in running.stdout.readline():
             assert running.poll() is None
         time.sleep(0.05)
         running.send_signal(number)

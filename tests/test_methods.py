@@ -3,9 +3,11 @@
 import pytest
 import torch
 
-from goalgan_bt import config, record
-from goalgan_bt.methods import METHODS
-from goalgan_bt.train import train
+from goalgan_bt.learners import maze_config, table
+from goalgan_bt.learners.maze import train
+from goalgan_bt.learners.methods import METHODS
+from goalgan_bt.runs.errors import UsageError
+from goalgan_bt.runs.metrics_csv import read_metrics
 
 SHORT = (  # long enough for goals of intermediate difficulty, so that there are traces
     "--env point_umaze --iterations 4 --threads 1 --coverage.rollouts 1 --gan.pretrain-steps 20 "
@@ -15,9 +17,9 @@ SHORT = (  # long enough for goals of intermediate difficulty, so that there are
 
 def trained_with(folder, *flags):
     folder.mkdir()
-    train(config.from_command_line([*SHORT.split(), *flags]), folder)
-    rows = record.read_metrics(folder)[1]
-    return torch.load(folder / "checkpoint.pt", weights_only=True)["modules"]["policy"], rows
+    train(table.from_command_line([*SHORT.split(), *flags]), folder)
+    rows = read_metrics(folder)[1]
+    return torch.load(folder / "checkpoint.pt", weights_only=True)["learner"]["policy"], rows
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -45,13 +47,13 @@ def test_without_imitation_traces_leave_the_policy_alone(tmp_path):
 
 def test_flags_come_on_top_of_the_method():
     flags = "--env point_umaze --method uniform --goals.new 50"
-    cfg = config.from_command_line(flags.split())
+    cfg = table.from_command_line(flags.split())
     assert (cfg.goals.source, cfg.goals.new, cfg.goals.old) == ("uniform", 50, 0)
     assert cfg.backtracking.trace_length == 0 and cfg.method == "uniform"
-    with pytest.raises(config.ConfigError, match="unknown method 'magic': choose one of recall"):
-        config.from_command_line(["--method", "magic"])
+    with pytest.raises(UsageError, match="unknown method 'magic': choose one of recall"):
+        table.from_command_line(["--method", "magic"])
 
 
 def test_every_setting_of_every_method_exists():
     for method in METHODS:
-        config.check(config.with_method(config.preset("ant_umaze"), method))
+        table.check(maze_config.with_method(maze_config.preset("ant_umaze"), method))

@@ -4,7 +4,7 @@ import matplotlib.image
 import pytest
 from conftest import run_module
 
-from goalgan_bt import record
+from goalgan_bt.runs.frames import frame_paths
 from goalgan_bt.viz import pictures
 
 
@@ -54,7 +54,7 @@ def test_damaged_runs_are_one_line(folder, tmp_path, damage):
     other = tmp_path / "point_umaze-damaged"
     shutil.copytree(folder, other)
     if damage == "frame":
-        frame = record.frames(other)[0]
+        frame = frame_paths(other)[0]
         frame.write_bytes(frame.read_bytes()[:100])
     elif damage == "meta":
         (other / "meta.json").write_text("{}")

@@ -5,16 +5,15 @@ import pytest
 import torch
 from gymnasium.wrappers.utils import RunningMeanStd
 
-from goalgan_bt.policy import (
+from goalgan_bt.agent.policy import (
     Actor,
     GaussianPolicy,
     Normaliser,
-    PolicyConfig,
-    ValueConfig,
     ValueFunction,
     log_prob,
     mean_kl,
 )
+from goalgan_bt.agent.settings import PolicyConfig, ValueConfig
 
 
 def test_the_normaliser_is_gymnasiums():

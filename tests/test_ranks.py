@@ -12,9 +12,10 @@ import pytest
 import torch
 from conftest import run_module
 
-from goalgan_bt import checkpoint, config, ranks
-from goalgan_bt.learner import Learner
-from goalgan_bt.train import make_env
+from goalgan_bt.learners import maze_config, maze_learner, table
+from goalgan_bt.learners.maze_config import make_env
+from goalgan_bt.learners.maze_learner import MazeLearner
+from goalgan_bt.runs import ranks
 
 TWO = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
 # A GAN amplifies rounding within a hundred steps: two show that it is given the same.
@@ -98,7 +99,9 @@ def test_one_and_two_ranks_make_the_same_update(tmp_path):
     assert len(one["estimator_goals"]) > 0
     assert torch.allclose(one["estimator_goals"], two["estimator_goals"], atol=1e-3)
     assert torch.equal(one["estimator_success"], two["estimator_success"])
-    fresh = Learner(make_env(config.preset("point_umaze"), 1), config.preset("point_umaze"))
+    fresh = MazeLearner(
+        make_env(maze_config.preset("point_umaze"), 1), maze_config.preset("point_umaze")
+    )
     moved = (one["modules"]["policy"]["net.flat"] - fresh.policy.net.flat.detach()).abs().max()
     apart = (one["modules"]["policy"]["net.flat"] - two["modules"]["policy"]["net.flat"]).abs()
     assert apart.max() < 0.01 * moved
@@ -121,9 +124,9 @@ def test_a_rank_that_dies_ends_the_run_with_a_usable_checkpoint(tmp_path, victim
     (folder,) = tmp_path.iterdir()
     if victim == 1:
         assert f"--resume {folder}" in line
-    cfg = config.load(folder)
-    learner = Learner(make_env(cfg, 1), cfg)
-    checkpoint.load(learner, folder)
+    cfg = table.load(folder)
+    learner = MazeLearner(make_env(cfg, 1), cfg)
+    maze_learner.load(learner, folder)
     more = learner.steps["train"] + 3000
     resumed = run_module("train", "--resume", folder, "--total-steps", more, "--viz", "none")
     assert resumed.returncode == 0, resumed.stderr

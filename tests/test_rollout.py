@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from goalgan_bt import envs
-from goalgan_bt.policy import GaussianPolicy, PolicyConfig
-from goalgan_bt.rollout import Collector, RolloutConfig
+from goalgan_bt.agent.policy import GaussianPolicy
+from goalgan_bt.agent.rollout import Collector
+from goalgan_bt.agent.settings import PolicyConfig, RolloutConfig
 
 
 def make(name="point_umaze", n=16, steps=40, chain=0.0, horizon=25, seed=0, failures=False):

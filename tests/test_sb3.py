@@ -17,8 +17,9 @@ from stable_baselines3.common.evaluation import evaluate_policy  # noqa: E402
 from stable_baselines3.common.logger import configure  # noqa: E402
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize  # noqa: E402
 
-from goalgan_bt import sb3  # noqa: E402
-from goalgan_bt.sb3 import RecallConfig, RecallTraces, Seen, Trajectory  # noqa: E402
+from goalgan_bt.learners import stable_baselines  # noqa: E402
+from goalgan_bt.learners.stable_baselines import RecallTraces, Seen, Trajectory  # noqa: E402
+from goalgan_bt.recall.settings import RecallConfig  # noqa: E402
 
 FASTEST = np.array([0.2, 0.4], np.float32)
 AGENTS = {"SAC": SAC, "TRPO": sb3_contrib.TRPO, "PPO": PPO}
@@ -340,7 +341,7 @@ def test_the_forward_control_imitates_what_it_imagined_to_end_well(name, monkeyp
 
     def ends(ways):
         """How far to the right it gets on the mean, always from the same place."""
-        monkeypatch.setattr(sb3, "WAYS", ways)
+        monkeypatch.setattr(stable_baselines, "WAYS", ways)
         begins = np.full((1, 2), 0.1, np.float32)
         states, actions, valid = callback._imagine(callback.dynamics, space, begins)
         assert valid.shape == (5, 60 * ways) and valid.all() and abs(actions).max() <= 1
@@ -395,8 +396,12 @@ def test_traces_begin_where_it_pays_to_be(monkeypatch):
     model = agent("PPO", make_vec_env(Reach, n_envs=1, seed=0))
     model.learn(256, callback=callback)
     callback._values = lambda obs: obs[:, 0] * 10  # the critic likes the right
-    begun, unroll = [], sb3.recall_traces
-    monkeypatch.setattr(sb3, "recall_traces", lambda *a: begun.append(a[2][0]) or unroll(*a))
+    begun, unroll = [], stable_baselines.recall_traces
+    monkeypatch.setattr(
+        stable_baselines,
+        "recall_traces",
+        lambda model, seeds, *a, **k: begun.append(seeds[0]) or unroll(model, seeds, *a, **k),
+    )
     callback.trajectories.clear()
     line = np.linspace(-1, 1, 201)
     obs = np.column_stack([line, line])
@@ -507,7 +512,7 @@ def test_the_ratio_told_is_of_policy_and_model(monkeypatch):
     callback, found = recall(), []
     model = agent("PPO", make_vec_env(Reach, n_envs=2, seed=0))
     model.learn(2048, callback=callback)
-    unroll = sb3.recall_traces
+    unroll = stable_baselines.recall_traces
 
     def cut(*given):
         traces = unroll(*given)
@@ -515,7 +520,7 @@ def test_the_ratio_told_is_of_policy_and_model(monkeypatch):
         found.append((given[2], traces))
         return traces
 
-    monkeypatch.setattr(sb3, "recall_traces", cut)
+    monkeypatch.setattr(stable_baselines, "recall_traces", cut)
     monkeypatch.setattr(callback, "_imitate", lambda s, a, seen: {"log_pi": 7.0})
     told = callback.turn()
     ((seeds, (states, actions, valid)),) = [(s, t[:3]) for s, t in found]
@@ -558,9 +563,13 @@ def test_the_optimiser_goes_on_where_it_was(tmp_path):
 def test_rewards_and_values_are_added_in_the_critics_units(monkeypatch):
     """Where rewards are normalised, its values are of normalised ones."""
     env = VecNormalize(make_vec_env(Reach, n_envs=2, seed=0))
-    callback, begun, unroll = recall(traces=1), [], sb3.recall_traces
+    callback, begun, unroll = recall(traces=1), [], stable_baselines.recall_traces
     agent("PPO", env).learn(1024, callback=callback)
-    monkeypatch.setattr(sb3, "recall_traces", lambda *a: begun.append(a[2][0]) or unroll(*a))
+    monkeypatch.setattr(
+        stable_baselines,
+        "recall_traces",
+        lambda model, seeds, *a, **k: begun.append(seeds[0]) or unroll(model, seeds, *a, **k),
+    )
     callback._values = lambda obs: 1.0 * (obs[:, 0] > np.median(obs[:, 0]))
     line = np.linspace(-1, 1, 201)
     obs, rewards = np.column_stack([line, line]), np.zeros(200)

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from goalgan_bt import config
 from goalgan_bt.envs import mazes
-from goalgan_bt.train import make_env
+from goalgan_bt.learners import maze_config
+from goalgan_bt.learners.maze_config import make_env
 
 ROOT = Path(__file__).parents[1]
 NAMES = {
@@ -96,7 +96,7 @@ def test_a_single_body_slides_as_many_do(rivals, layout):
 
 @pytest.mark.parametrize("name", ["point_umaze", "ant_umaze"])
 def test_sb3_trains_on_our_physics(rivals, name):
-    cfg = config.preset(name)
+    cfg = maze_config.preset(name)
     single, ours = rivals.SingleMaze(cfg), make_env(cfg, 1)
     obs, _ = single.reset(seed=0)
     assert obs.shape == (ours.obs_dim,) == single.observation_space.shape
@@ -112,7 +112,10 @@ def test_sb3_trains_on_our_physics(rivals, name):
 
 @pytest.mark.parametrize("name", ["point_umaze", "ant_umaze"])
 def test_sb3s_episodes_end_as_ours(rivals, name):
-    single, ours = rivals.SingleMaze(config.preset(name)), make_env(config.preset(name), 1)
+    single, ours = (
+        rivals.SingleMaze(maze_config.preset(name)),
+        make_env(maze_config.preset(name), 1),
+    )
     single.reset(seed=0)
     single._goal = ours.start_state[:2]
     *_, reward, terminated, truncated, _ = single.step(np.zeros(ours.act_dim))

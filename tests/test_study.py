@@ -15,11 +15,16 @@ import numpy as np
 import pytest
 from conftest import run_module
 
-from goalgan_bt import checkpoint, config, locomotion, record, study
-from goalgan_bt.command_line import UsageError
+from goalgan_bt.learners import locomotion, table
+from goalgan_bt.runs import checkpoint, run_folder
+from goalgan_bt.runs.errors import RunError, UsageError
+from goalgan_bt.runs.metrics_csv import read_metrics
+from goalgan_bt.study import __main__, execute, plan
+from goalgan_bt.study.tables import Tables
 
-evidence = pytest.importorskip("goalgan_bt.evidence")
-Curve = evidence.Curve
+statistics = pytest.importorskip("goalgan_bt.study.statistics")
+report = pytest.importorskip("goalgan_bt.study.report")
+Curve = statistics.Curve
 
 TINY = """
 envs = ["point_umaze"]
@@ -37,30 +42,30 @@ def curve(*coverage):
 
 
 def test_time_to_a_threshold_lies_on_the_line_between_reports():
-    assert evidence.time_to(curve(0.2, 0.6, 0.5), 0.4) == pytest.approx(1.5e6)
-    assert evidence.time_to(curve(0.2, 0.6, 0.5), 0.6) == pytest.approx(2e6)
-    assert evidence.time_to(curve(0.5), 0.25) == pytest.approx(0.5e6)
-    assert evidence.time_to(curve(0.2, 0.6), 0.61) == np.inf
+    assert statistics.time_to(curve(0.2, 0.6, 0.5), 0.4) == pytest.approx(1.5e6)
+    assert statistics.time_to(curve(0.2, 0.6, 0.5), 0.6) == pytest.approx(2e6)
+    assert statistics.time_to(curve(0.5), 0.25) == pytest.approx(0.5e6)
+    assert statistics.time_to(curve(0.2, 0.6), 0.61) == np.inf
 
 
 def test_area_is_the_mean_coverage():
-    assert evidence.area(curve(0.5, 0.5)) == pytest.approx((0.25 + 0.5) / 2)
+    assert statistics.area(curve(0.5, 0.5)) == pytest.approx((0.25 + 0.5) / 2)
 
 
 def test_the_interquartile_mean_drops_the_extremes():
-    assert evidence.iqm(np.array([100.0, 1, 2, 3, -50, 2, 2, 2])) == pytest.approx(2)
+    assert statistics.iqm(np.array([100.0, 1, 2, 3, -50, 2, 2, 2])) == pytest.approx(2)
 
 
 def test_ratios_are_paired_by_seed():
     """Seeds differ tenfold, each pair by a half: the interval is a point."""
     slow = [Curve(np.array([0, 1e6 * k, 9e7]), np.array([0, 0.5, 0.5])) for k in (1, 10, 4)]
     fast = [Curve(c.steps * [1, 0.5, 1], c.values) for c in slow]
-    halved = evidence.ratio(fast, slow, 0.5)
+    halved = statistics.ratio(fast, slow, 0.5)
     assert halved.estimate == pytest.approx((0.5, 0.5, 0.5)) and halved.reached == (3, 3)
     assert str(halved) == "0.50 [0.50, 0.50] (3, 3)"
-    assert evidence.ratio(slow, fast, 0.5).estimate == pytest.approx((2, 2, 2))
+    assert statistics.ratio(slow, fast, 0.5).estimate == pytest.approx((2, 2, 2))
     never = [Curve(c.steps, c.values / 2) for c in slow]
-    assert str(evidence.ratio(fast, never, 0.5)) == "(3, 0)"  # no figure: theirs never arrive
+    assert str(statistics.ratio(fast, never, 0.5)) == "(3, 0)"  # no figure: theirs never arrive
 
 
 @pytest.mark.parametrize("n", [5, 10])
@@ -72,7 +77,7 @@ def test_the_ratios_interval_covers_the_truth_as_often_as_it_says(n):
         pair = [
             [Curve(np.array([0, t, 1e9]), np.array([0, 0.5, 0.5])) for t in row] for row in times
         ]
-        found = evidence.ratio(*pair, 0.5).estimate
+        found = statistics.ratio(*pair, 0.5).estimate
         hits += found.low <= 0.7 <= found.high
     assert 0.93 < hits / 1000 < 0.97
 
@@ -81,11 +86,11 @@ def test_the_interval_covers_the_truth_as_often_as_it_says():
     rng = np.random.default_rng(0)
     hits = 0
     for _ in range(200):
-        found = evidence.interval(rng.normal(1.0, 1.0, 20))
+        found = statistics.interval(rng.normal(1.0, 1.0, 20))
         assert found.low <= found.value <= found.high
         hits += found.low <= 1.0 <= found.high
     assert 0.85 < hits / 200 < 0.99
-    assert np.isnan(evidence.interval(np.array([0.3])).low)
+    assert np.isnan(statistics.interval(np.array([0.3])).low)
 
 
 @pytest.fixture(scope="module")
@@ -171,8 +176,8 @@ def test_a_study_of_returns(tmp_path):
     assert again.returncode == 0 and "1 runs of 2 to go" in again.stdout
     assert len(made) == 2 == len(sorted((tmp_path / "runs").glob("*/*/*/*/ended.txt")))
     # In the picture there are the curves.
-    spec = study.load(str(tmp_path / "run.toml"))
-    drawn = evidence.draw(spec, evidence.curves(study.Tables(tmp_path / "run", "return")))
+    spec = plan.load(str(tmp_path / "run.toml"))
+    drawn = statistics.draw(spec, report.curves(Tables(tmp_path / "run", "return")))
     low, high = drawn.axes[0].get_ylim()
     returns = [float(row["return"]) for row in rows]
     assert low < min(returns) and high > np.mean(returns)
@@ -196,27 +201,27 @@ def test_differences_are_paired_by_seed():
         name: {seed: Curve(steps, np.array([0.0, more + 100 * seed])) for seed in range(3)}
         for name, more in (("recall_traces", 10.0), ("trpo", 0.0), ("forward_model", 4.0))
     }
-    assert evidence._differences(of)[4:] == [
+    assert report._differences(of)[4:] == [
         "| recall_traces less trpo | 3 | 5.00 [5.00, 5.00] | 10 [10, 10] |",
         "| forward_model less trpo | 3 | 2.00 [2.00, 2.00] | 4.00 [4.00, 4.00] |",
         "| recall_traces less forward_model | 3 | 3.00 [3.00, 3.00] | 6.00 [6.00, 6.00] |",
     ]
-    assert evidence.area(Curve(steps[:1], np.array([7.0]))) == 7.0
+    assert statistics.area(Curve(steps[:1], np.array([7.0]))) == 7.0
 
 
 def test_a_run_that_was_cut_off_goes_on(finished, tmp_path):
     root, _ = finished
-    run = study.grid(study.load(str(root / "tiny.toml")))[0]
+    run = plan.grid(plan.load(str(root / "tiny.toml")))[0]
     place = shutil.copytree(root / "runs/tiny/point_umaze/recall_traces-s0", tmp_path / "run")
     (folder,) = place.iterdir()
     (folder / "ended.txt").unlink()
-    assert study.perform(run, place) == folder  # it was killed just before it could say so
+    assert execute.perform(run, place) == folder  # it was killed just before it could say so
     longer = run._replace(flags=run.flags.replace("--iterations 3", "--iterations 4"))
-    with pytest.raises(study.record.RunError, match="was begun with other settings"):
-        study.perform(longer, place)
+    with pytest.raises(RunError, match="was begun with other settings"):
+        execute.perform(longer, place)
     settings = (folder / "config.json").read_text()
     (folder / "config.json").write_text(settings.replace('"iterations": 3', '"iterations": 4'))
-    assert study.perform(longer, place) == folder
+    assert execute.perform(longer, place) == folder
     assert (folder / "metrics.csv").read_text().splitlines()[-1].startswith("4,")
     assert (folder / "ended.txt").read_text().startswith("complete")
 
@@ -276,54 +281,56 @@ def test_a_training_that_is_just_being_started_ends_too(tmp_path, monkeypatch):
     begin = time.monotonic()
     try:
         signal.setitimer(signal.ITIMER_REAL, 0.2)
-        runs = [study.Run("hopper", "recall_traces", seed, "") for seed in range(3)]
-        cfg = study.StudyConfig("tiny", processes=2)
+        runs = [plan.Trial("hopper", "recall_traces", seed, "") for seed in range(3)]
+        cfg = __main__.StudyConfig("tiny", processes=2)
         with pytest.raises(KeyboardInterrupt):
-            next(study.finished(cfg, runs, tmp_path))
+            next(execute.finished(cfg, runs, tmp_path))
     finally:
         signal.signal(signal.SIGALRM, known)
-    assert time.monotonic() - begin < 10 and not study.TRAININGS
+    assert time.monotonic() - begin < 10 and not execute.TRAININGS
 
 
 def test_settings_are_known_to_every_thread():
     """Two command lines parsed at a time spoil each other, and where standard output goes."""
-    runs = study.grid(study.load("locomotion_lengths")) + study.grid(study.load("ablations"))
+    runs = plan.grid(plan.load("locomotion_lengths")) + plan.grid(plan.load("ablations"))
     output, interval = sys.stdout, sys.getswitchinterval()
     sys.setswitchinterval(1e-5)
     try:
         with ThreadPoolExecutor(4) as pool:
-            found = list(pool.map(study.settings, runs))
+            found = list(pool.map(plan.settings, runs))
     finally:
         sys.setswitchinterval(interval)
         spoilt, sys.stdout = sys.stdout is not output, output
     assert not spoilt
     for run, cfg in list(zip(runs, found, strict=True))[::7]:
-        words = study.words(run)
-        assert cfg == (config.other_learner(words) or config).from_command_line(words)
+        words = plan.words(run)
+        assert cfg == table.from_command_line(words)
 
 
 def test_locomotion_that_was_cut_off_goes_on(tmp_path):
     pytest.importorskip("sb3_contrib")
     flags = "--method sac --total-steps 200 --backtracking.trace-length 0 --episodes 1"
-    run = study.Run("hopper", "sac", 0, flags)
-    cfg = replace(study.settings(run), out=tmp_path)
-    folder = record.new_run(tmp_path, "hopper", 0, asdict(cfg))
+    run = plan.Trial("hopper", "sac", 0, flags)
+    cfg = replace(plan.settings(run), out=tmp_path)
+    folder = run_folder.new_run(tmp_path, "hopper", 0, asdict(cfg))
     agent, _ = locomotion.make(cfg)
     agent.learn(80)
-    done = {"done": (10, 0, 1.0, 0.0)}
+    steps = {"train": 80, "label": 0, "eval": 0}
+    run_state = {"iteration": 10, "steps": steps, "seconds": 1.0, "next_measurement": 0.0}
+    done = {"run": run_state, "return": 0.0}
     checkpoint.save(done | locomotion.state_dict(agent, None), folder / "checkpoint.pt")
-    assert study.perform(run, tmp_path) == folder
-    _, rows = record.read_metrics(folder)
+    assert execute.perform(run, tmp_path) == folder
+    _, rows = read_metrics(folder)
     assert rows[0]["iteration"] == "11" and rows[0]["steps/train"] == "88"
     assert rows[-1]["iteration"] == "25" and rows[-1]["steps/train"] == "200"
-    (resumed,) = record.read_meta(folder)["resumed"]
-    assert resumed["argv"] == ["--resume", str(folder)]
+    (resumed,) = run_folder.read_meta(folder)["resumed"]
+    assert resumed["argv"] == ["--resume", str(folder), "--viz", "none"]
 
     agent.learn(1)
     checkpoint.save(done | locomotion.state_dict(agent, None), folder / "checkpoint.pt")
-    (folder / record.ENDED).unlink()
-    with pytest.raises(record.RunError, match="begun with other settings"):
-        study.perform(run._replace(flags=flags + " --hidden 8"), tmp_path)
+    (folder / run_folder.ENDED).unlink()
+    with pytest.raises(RunError, match="begun with other settings"):
+        execute.perform(run._replace(flags=flags + " --hidden 8"), tmp_path)
 
 
 def test_a_report_names_its_commits():
@@ -331,10 +338,10 @@ def test_a_report_names_its_commits():
         return {"commit": commit, "method": method, "env": "e"}
 
     ours, other = 40 * "a", 40 * "b"
-    assert evidence._commits([row(ours, "x")]) == f"Commit: {ours[:12]}."
+    assert report._commits([row(ours, "x")]) == f"Commit: {ours[:12]}."
     several = [row(f"{other}-dirty", "y"), row(ours, "x"), row(ours, "y"), row("", "z")]
     several.append(row(f"{ours}+{other}", "z"))  # resumed
-    assert evidence._commits(several) == (
+    assert report._commits(several) == (
         f"Commit: {ours[:12]}; {other[:12]}-dirty for 1 of the runs of y of e; "
         f"unknown for 1 of the runs of z of e; {ours[:12]}+{other[:12]} for 1 of the runs of "
         "z of e."
@@ -342,15 +349,15 @@ def test_a_report_names_its_commits():
 
 
 def test_a_run_that_fails_says_why(tmp_path):
-    run = study.Run("point_umaze", "mine", 3, "--rollout.num-envs 8 --iterations 1")
+    run = plan.Trial("point_umaze", "mine", 3, "--rollout.num-envs 8 --iterations 1")
     (tmp_path / "file").write_text("")
-    with pytest.raises(study.record.RunError, match="point_umaze, mine, seed 3 failed: error: can"):
-        study.perform(run._replace(flags=run.flags + f" --map {tmp_path}"), tmp_path / "runs")
+    with pytest.raises(RunError, match="point_umaze, mine, seed 3 failed: error: can"):
+        execute.perform(run._replace(flags=run.flags + f" --map {tmp_path}"), tmp_path / "runs")
 
 
 def test_two_studies_do_not_share_a_table(finished):
     root, _ = finished
-    tables = study.Tables(root / "out/tiny", "coverage")
+    tables = Tables(root / "out/tiny", "coverage")
     words = "study", root / "tiny.toml", "--out", root / "out"
     other = run_module(*words)
     assert other.returncode == 2 and "another study's at work" in other.stderr
@@ -362,7 +369,7 @@ def test_a_table_cut_off_between_its_files_mends_itself(finished, tmp_path):
     out = shutil.copytree(root / "out/tiny", tmp_path / "tiny")
     lines = (out / "costs.csv").read_text().splitlines(keepends=True)
     (out / "costs.csv").write_text("".join(line for line in lines if ",goal_gan,0," not in line))
-    tables = study.Tables(out, "coverage")
+    tables = Tables(out, "coverage")
     keys = {(row["method"], row["seed"]) for row in tables.curves}
     assert len(keys) == 3 and ("goal_gan", "0") not in keys
 
@@ -394,7 +401,7 @@ def test_a_table_cut_off_between_its_files_mends_itself(finished, tmp_path):
 def test_bad_files_end_in_one_line(text, words, tmp_path):
     (tmp_path / "bad.toml").write_text(text)
     with pytest.raises(UsageError, match=words):
-        study.load(str(tmp_path / "bad.toml"))
+        plan.load(str(tmp_path / "bad.toml"))
 
 
 def test_unknown_and_unfinished_studies_end_in_one_line(tmp_path):
@@ -404,8 +411,8 @@ def test_unknown_and_unfinished_studies_end_in_one_line(tmp_path):
         assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize("name", [path.stem for path in study.SHIPPED.glob("*.toml")])
+@pytest.mark.parametrize("name", [path.stem for path in plan.SHIPPED.glob("*.toml")])
 def test_the_studies_that_come_along_can_be_run(name):
-    spec = study.load(name)
-    assert len(study.grid(spec)) == len(spec.seeds) * len(spec.methods) * len(spec.envs)
+    spec = plan.load(name)
+    assert len(plan.grid(spec)) == len(spec.seeds) * len(spec.methods) * len(spec.envs)
     assert "recall_traces" in spec.methods

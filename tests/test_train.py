@@ -14,10 +14,15 @@ import pytest
 import torch
 from conftest import run_module
 
-from goalgan_bt import checkpoint, config, record
-from goalgan_bt.learner import Learner
-from goalgan_bt.record import RunError
-from goalgan_bt.train import Stop, make_env, train
+from goalgan_bt.learners import maze_learner, table
+from goalgan_bt.learners.maze import train
+from goalgan_bt.learners.maze_config import make_env
+from goalgan_bt.learners.maze_learner import MazeLearner
+from goalgan_bt.runs import run_folder
+from goalgan_bt.runs.errors import RunError
+from goalgan_bt.runs.frames import frame_paths, read_frame
+from goalgan_bt.runs.metrics_csv import read_metrics
+from goalgan_bt.runs.signals import Stop
 
 TINY = {
     "point_umaze": "--rollout.num-envs 32 --rollout.steps 50 --backtracking.min-transitions 200",
@@ -32,7 +37,7 @@ FAST = (
 
 def settings(env, *more):
     words = f"--env {env} {TINY[env]} {FAST} --threads 1".split()
-    return config.from_command_line([*words, *more])
+    return table.from_command_line([*words, *more])
 
 
 def command(*flags, out):
@@ -59,15 +64,15 @@ def start(out):
 
 def columns(folder):
     """metrics.csv without the columns that measure time and memory."""
-    _, rows = record.read_metrics(folder)
+    _, rows = read_metrics(folder)
     return [{k: v for k, v in r.items() if not k.startswith(("time/", "memory/"))} for r in rows]
 
 
 @pytest.mark.parametrize("env", TINY)
 def test_a_tiny_run_leaves_a_whole_run_folder(env, tmp_path):
     cfg = settings(env, "--iterations", "6")
-    record.write_meta(tmp_path, None)
-    coverage, steps = train(cfg, tmp_path)
+    run_folder.write_meta(tmp_path, None)
+    _, _, coverage, steps = train(cfg, tmp_path)
     assert steps == 7 * 32 * 50  # the first batch made the goals of the first iteration
     assert 0 <= coverage <= 1
     rows = columns(tmp_path)
@@ -77,7 +82,7 @@ def test_a_tiny_run_leaves_a_whole_run_folder(env, tmp_path):
     assert 0 <= float(rows[1]["eval/coverage"]) <= 1  # not in the first: it shall show soon
     assert int(rows[-1]["steps/train"]) == steps and int(rows[-1]["steps/eval"]) > 0
     assert (int(rows[-1]["steps/label"]) > 0) == (env == "point_nd")  # fresh labels there
-    frames = record.frames(tmp_path)
+    frames = frame_paths(tmp_path)
     assert len(frames) == 6
     with np.load(frames[-1], allow_pickle=False) as frame:
         n = len(frame["goals"])
@@ -119,7 +124,7 @@ def test_same_seed_same_metrics(tmp_path):
 
 
 def test_resume_goes_on_where_the_checkpoint_was(tmp_path):
-    record.write_meta(tmp_path, None)
+    run_folder.write_meta(tmp_path, None)
     train(settings("point_umaze", "--iterations", "3"), tmp_path)
     first = columns(tmp_path)
     cfg = replace(settings("point_umaze", "--iterations", "5"), resume=tmp_path)
@@ -132,28 +137,35 @@ def test_resume_goes_on_where_the_checkpoint_was(tmp_path):
     assert int(rows[4]["steps/eval"]) > int(rows[2]["steps/eval"])
 
 
+def same(x, y):
+    """Whether two states are, in every tensor and value."""
+    if isinstance(x, torch.Tensor):
+        return torch.equal(x, y)
+    if isinstance(x, dict):
+        return x.keys() == y.keys() and all(same(x[key], y[key]) for key in x)
+    if isinstance(x, list | tuple):
+        return len(x) == len(y) and all(map(same, x, y))
+    return x == y
+
+
 def test_a_checkpoint_holds_everything(tmp_path):
     """A learner of another seed becomes the one that was saved, in every part."""
     cfg, other = settings("ant_umaze", "--seed", "1"), settings("ant_umaze", "--seed", "9")
     env = make_env(cfg, 8)
     train(replace(cfg, iterations=6), tmp_path)
-    saved, loaded = Learner(env, cfg), Learner(env, other)
-    checkpoint.load(saved, tmp_path)
-    assert saved.iteration == 6 and len(saved.visited) > 3 and saved.transitions.size > 0
+    saved, loaded = MazeLearner(env, cfg), MazeLearner(env, other)
+    run = maze_learner.load(saved, tmp_path)
+    assert run["iteration"] == 6 and run["steps"]["train"] > 0 < run["seconds"]
+    assert len(saved.curriculum.visited) > 3 and saved.transitions.size > 0
+    assert not same(saved.state_dict(), loaded.state_dict())
     loaded.load_state_dict(saved.state_dict())
+    assert same(saved.state_dict(), loaded.state_dict())
     x, y = saved, loaded
     assert x.rng.random() == y.rng.random()
-    assert torch.equal(x.gan._noise(3), y.gan._noise(3))
-    assert (x.steps, x.seconds, x.next_coverage) == (y.steps, y.seconds, y.next_coverage)
-    assert np.array_equal(x.replay.goals, y.replay.goals)
-    assert np.array_equal(x.visited.goals, y.visited.goals)
-    assert np.array_equal(x.estimator.goals, y.estimator.goals)
-    assert np.array_equal(x.estimator.success, y.estimator.success)
-    assert np.array_equal(x.transitions.states, y.transitions.states)
+    assert np.array_equal(x.curriculum.propose(3), y.curriculum.propose(3))
     assert x.transitions.cursor == y.transitions.cursor
-    for name, module in x._modules().items():
-        ours, theirs = module.state_dict(), y._modules()[name].state_dict()
-        assert repr(ours) == repr(theirs), name
+    for ours, theirs in zip(x.tensors(), y.tensors(), strict=True):
+        assert torch.equal(ours, theirs)
 
 
 def test_a_failed_resume_leaves_the_run_as_it_was(tmp_path):
@@ -176,8 +188,8 @@ def test_a_resumed_learner_takes_new_learning_rates_and_buffers(tmp_path):
     train(settings("ant_umaze", "--iterations", "8"), tmp_path)
     more = "--value.learning-rate", "0.5", "--backtracking.buffer", "200000"
     cfg = settings("ant_umaze", *more)
-    learner = Learner(make_env(cfg, 2), cfg)
-    checkpoint.load(learner, tmp_path)
+    learner = MazeLearner(make_env(cfg, 2), cfg)
+    maze_learner.load(learner, tmp_path)
     assert learner.value.optimiser.param_groups[0]["lr"] == 0.5
     rows = learner.transitions
     rows.add(*(np.ones_like(getattr(rows, name)[:4]) for name in rows.COLUMNS))
@@ -207,11 +219,11 @@ def test_a_damaged_checkpoint_is_refused_in_one_line(tmp_path, damage):
     elif damage == "empty":
         path.write_bytes(b"")
     elif damage == "pickle":
-        torch.save({"modules": print}, path)
+        torch.save({"learner": print}, path)
     else:
         cfg = settings("point_umaze", "--policy.hidden", "5")
     with pytest.raises(RunError, match=r"start a new run|cannot resume") as error:
-        checkpoint.load(Learner(make_env(cfg, 2), cfg), tmp_path)
+        maze_learner.load(MazeLearner(make_env(cfg, 2), cfg), tmp_path)
     assert "\n" not in str(error.value)
 
 
@@ -268,7 +280,7 @@ def test_a_resumed_run_stays_in_its_own_maze(tmp_path, now):
     (folder,) = out.iterdir()
     done = run("--resume", folder, "--iterations", 4, out=out)
     assert done.returncode == 0, done.stderr
-    tiles = {len(record.read_frame(frame)["test_goals"]) for frame in record.frames(folder)}
+    tiles = {len(read_frame(frame)["test_goals"]) for frame in frame_paths(folder)}
     assert tiles == {3 * 16}  # three free cells, throughout
 
 

@@ -9,10 +9,10 @@ from stable_baselines3.common.logger import configure
 from test_mlp import by_torch
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-from goalgan_bt import trpo
-from goalgan_bt.mlp import CHUNK
-from goalgan_bt.policy import GaussianPolicy, PolicyConfig, log_prob, mean_kl
-from goalgan_bt.trpo import TrpoConfig
+from goalgan_bt.agent import trpo
+from goalgan_bt.agent.networks import CHUNK
+from goalgan_bt.agent.policy import GaussianPolicy, log_prob, mean_kl
+from goalgan_bt.agent.settings import PolicyConfig, TrpoConfig
 
 
 def make_policy(hidden=(4,), obs_dim=3, act_dim=2, seed=0):

@@ -14,18 +14,22 @@ import zstandard
 from conftest import TINY, run_module, serve
 from viser import _messages
 
-from goalgan_bt import config, record
 from goalgan_bt.envs import maze as mazes
-from goalgan_bt.train import train
+from goalgan_bt.learners import table
+from goalgan_bt.learners.maze import train
+from goalgan_bt.runs import run_folder
+from goalgan_bt.runs.errors import RunError
+from goalgan_bt.runs.frames import read_frame
+from goalgan_bt.runs.metrics_csv import Metrics
+from goalgan_bt.runs.run_writer import RunWriter
+from goalgan_bt.study.published import published
+from goalgan_bt.viz.captions import settings_table
 from goalgan_bt.viz.curves import joined, thinned
 from goalgan_bt.viz.download import as_csv
-from goalgan_bt.viz.metrics import Metrics
 from goalgan_bt.viz.player import Player
-from goalgan_bt.viz.published import published
 from goalgan_bt.viz.run import Run, success
 from goalgan_bt.viz.scene import colours, segments, tile_image
 from goalgan_bt.viz.view import View, report_at
-from goalgan_bt.viz.words import settings_table
 
 
 @pytest.fixture
@@ -89,7 +93,7 @@ def test_a_frame_that_is_written_anew_is_read_anew(folder):
     run = Run(folder)
     assert run.frame(2)["goals"].shape != (1, 2)
     few = {"goals": np.zeros((1, 2)), "test_goals": np.zeros((3, 2)), "coverage": np.zeros(3)}
-    record.Record(folder, 4).frame(2, **few)
+    RunWriter(folder, 4).frame(2, **few)
     assert run.frame(2)["goals"].shape == (1, 2)
 
 
@@ -117,7 +121,7 @@ def test_a_folder_that_vanishes_leaves_what_was_seen(folder):
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path):
-    with pytest.raises(record.RunError, match="is no run"):
+    with pytest.raises(RunError, match="is no run"):
         Run(tmp_path)
 
 
@@ -179,10 +183,10 @@ def test_curves_are_thinned_to_their_ends_and_joined_over_gaps():
 def test_the_last_report_is_on_show_and_follows_the_run(view, folder):
     assert "Iteration 4" in view._caption.content and "measured" in view._caption.content
     before = node(view, "/run0/coverage/node").image.copy()
-    record.Record(folder, 4)
-    frame = dict(record.read_frame(folder / "frames/000004.npz"))
+    RunWriter(folder, 4)
+    frame = dict(read_frame(folder / "frames/000004.npz"))
     frame["coverage"] = 1 - frame["coverage"]
-    record.Record(folder, 4).frame(6, **frame)
+    RunWriter(folder, 4).frame(6, **frame)
     view._last_look = 0.0
     view.tick(time.monotonic())
     assert "Iteration 6" in view._caption.content
@@ -220,11 +224,11 @@ def test_layers_are_shown_and_hidden(view):
 
 
 def test_frames_of_an_older_version_are_drawn_as_far_as_they_go(folder):
-    frame = record.read_frame(folder / "frames/000004.npz")
+    frame = read_frame(folder / "frames/000004.npz")
     few = {k: frame[k] for k in ("goals", "coverage", "test_goals")}
-    record.Record(folder, 4).frame(5, **few)
-    record.Record(folder, 5).frame(6, coverage=np.zeros(3))
-    record.Record(folder, 6).frame(7, **{**few, "coverage": np.full(112, np.nan)})
+    RunWriter(folder, 4).frame(5, **few)
+    RunWriter(folder, 5).frame(6, coverage=np.zeros(3))
+    RunWriter(folder, 6).frame(7, **{**few, "coverage": np.full(112, np.nan)})
     view = View([Run(folder)], port=0)
     for index in range(7):
         view._show(index)
@@ -303,8 +307,8 @@ def test_trouble_is_told_once_and_does_not_end_the_page(view, monkeypatch, capsy
 
 def test_a_run_without_walls_is_shown(tmp_path):
     words = TINY.replace("point_umaze", "point_nd --dim 4").split()
-    record.write_meta(tmp_path, None)
-    train(config.from_command_line(words), tmp_path)
+    run_folder.write_meta(tmp_path, None)
+    train(table.from_command_line(words), tmp_path)
     view = View([Run(tmp_path)], port=0)
     view._ask("all", None)
     view.tick(time.monotonic())
@@ -367,7 +371,7 @@ def test_the_body_acts_with_the_noise_that_was_recorded(folder):
 
 
 def test_csv_has_a_line_per_tile(folder):
-    lines = as_csv(record.read_frame(folder / "frames/000004.npz")).decode().splitlines()
+    lines = as_csv(read_frame(folder / "frames/000004.npz")).decode().splitlines()
     assert lines[0] == "goal_0,goal_1,success,measured" and len(lines) == 113
     assert all(line.endswith(",1") for line in lines[1:])
 

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,13 +11,14 @@ from conftest import TINY, run_module
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from goalgan_bt import config, envs
-from goalgan_bt.coverage import success_rate
+from goalgan_bt import envs
+from goalgan_bt.agent.coverage import success_rate
+from goalgan_bt.agent.policy import GaussianPolicy
 from goalgan_bt.envs import ant_maze
 from goalgan_bt.envs import maze as mazes
-from goalgan_bt.envs.batch import PhysicsError
+from goalgan_bt.envs.goal_env import PhysicsError
 from goalgan_bt.envs.warp_batch import MAX_CONSTRAINTS
-from goalgan_bt.policy import GaussianPolicy
+from goalgan_bt.learners import maze_config, table
 from goalgan_bt.viz.player import Player
 
 pytest.importorskip("array_api_compat", reason="the extra gpu is not installed")
@@ -143,9 +145,10 @@ def test_tensors_share_the_simulations_memory(worlds):
 
 
 @BOTH
-def test_episodes_on_the_device_are_the_environments(worlds, name):
+def test_episodes_on_the_device_are_the_environments(worlds, name, monkeypatch):
     """The same episodes through tensors and through numpy, resets included."""
-    from goalgan_bt.envs.device import DeviceEpisodes
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
+    from device_episodes import DeviceEpisodes
 
     host = worlds(name)
     device = DeviceEpisodes(envs.make(name, N, physics="warp", device="cpu", horizon=6))
@@ -171,7 +174,7 @@ def test_episodes_on_the_device_are_the_environments(worlds, name):
 def test_coverage_where_fewer_and_fewer_episodes_go_on(worlds):
     env = worlds("point_umaze")
     torch.manual_seed(0)
-    policy = GaussianPolicy(env.obs_dim, env.act_dim, config.POINT.policy)
+    policy = GaussianPolicy(env.obs_dim, env.act_dim, maze_config.POINT.policy)
     goals = np.array([[0.2, 0.0], [0.6, 0.0], [3.9, 0.0], [0.0, 0.2]])
     found = [
         success_rate(each, policy, goals, 2, torch.Generator().manual_seed(0))
@@ -269,7 +272,7 @@ def test_training_on_mujoco_warp(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     run = next(tmp_path.iterdir())
-    assert config.load(run).physics == "warp"
+    assert table.load(run).physics == "warp"
     assert (run / "checkpoint.pt").exists()
     assert Player(run).take_newest()  # the page plays it with MuJoCo
 

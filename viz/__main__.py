@@ -1,27 +1,29 @@
 """Open a page over run folders: `python -m goalgan_bt.viz RUN [RUN ...]`."""
 
-import os
-import signal
-import sys
+from goalgan_bt.runs.signals import leave_at_once
 
-if __name__ == "__main__":  # a page has nothing to lose: it goes at once, without a word
-    signal.signal(signal.SIGINT, lambda *_: os._exit(130))
-    signal.signal(signal.SIGTERM, lambda *_: os._exit(2))
+if __name__ == "__main__":
+    leave_at_once()
 
 import importlib.util
 import ipaddress
+import os
 import socket
+import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
-from goalgan_bt import config
-from goalgan_bt.command_line import UsageError, parse
-from goalgan_bt.progress import complain, say
-from goalgan_bt.record import env_of
-from goalgan_bt.viz.child import free_port
+from goalgan_bt.learners.table import learner_of
+from goalgan_bt.runs.command_line import check_ranges, parse, run_command
+from goalgan_bt.runs.errors import UsageError
+from goalgan_bt.runs.ranges import Range
+from goalgan_bt.runs.run_folder import env_of
+from goalgan_bt.runs.terminal import say
+from goalgan_bt.viz.page_process import free_port
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class ViewConfig:
     """Run folders: one in full, or several side by side."""
     host: str = "127.0.0.1"
     """Where to listen; 0.0.0.0 lets everybody on the network in, without a password."""
-    port: int = 8080
+    port: Annotated[int, Range("between 0 and 65535", 0, 65535)] = 8080
     """Port; if it is busy, the next free one is taken and printed. 0 takes any."""
     export: Path | None = None
     """Instead of a server, one HTML file that plays a run without any: scene, curves, settings."""
@@ -42,22 +44,27 @@ class ViewConfig:
     """End when standard input closes: for a page that another program starts."""
 
 
-def main() -> int:
+def main(argv: list[str] | None = None) -> int:
     """The command line; returns the exit code."""
-    try:
-        cfg = from_command_line()
-        for folder in cfg.runs:
-            check(folder)
-        if cfg.with_parent:
-            threading.Thread(target=_wait_for_parent, daemon=True).start()
-        if cfg.export is not None or cfg.movie is not None:
-            write(cfg)
-        else:
-            serve(cfg)
-    except (OSError, ValueError) as error:
-        complain(str(error))
-        return 2
-    return 0
+    return run_command(lambda: work(argv))
+
+
+def work(argv: list[str] | None) -> None:
+    """What the command line asks for.
+
+    Raises:
+        UsageError, RunError, OSError: saying what is wrong.
+    """
+    cfg = from_command_line(argv)
+    for folder in cfg.runs:
+        check(folder)
+    if cfg.with_parent:
+        threading.Thread(target=_wait_for_parent, daemon=True).start()
+    if cfg.export is not None or cfg.movie is not None:
+        write(cfg)
+    else:
+        leave_at_once()  # a page has nothing to lose
+        serve(cfg)
 
 
 def check(folder: Path) -> None:
@@ -66,7 +73,8 @@ def check(folder: Path) -> None:
     Raises:
         UsageError: if the run's learner draws none.
     """
-    if config.other_learner(["--env", env := env_of(folder)]):
+    env = env_of(folder)
+    if env and not learner_of(env).has_map:
         raise UsageError(f"{env} has no map: python -m goalgan_bt.plot draws the run's curve")
 
 
@@ -134,8 +142,7 @@ def from_command_line(argv: list[str] | None = None) -> ViewConfig:
         raise UsageError("--export and --movie show one run: name only one")
     if not cfg.host:
         raise UsageError("--host must name an address: 127.0.0.1 is this machine alone")
-    if not 0 <= cfg.port <= 65535:
-        raise UsageError(f"--port must be between 0 and 65535, not {cfg.port}")
+    check_ranges(cfg)
     return cfg
 
 

@@ -8,7 +8,7 @@ import viser
 from viser import uplot
 
 from goalgan_bt.envs.maze import FloatArray
-from goalgan_bt.viz.published import published
+from goalgan_bt.study.published import published
 from goalgan_bt.viz.run import Run
 
 MOST = 400  # points of a curve that are sent to the page

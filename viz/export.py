@@ -14,15 +14,15 @@ import viser
 from rich.progress import track
 from viser.infra import StateSerializer
 
-from goalgan_bt.config import ConfigError
-from goalgan_bt.record import RunError, write_atomically
+from goalgan_bt.runs.errors import RunError
+from goalgan_bt.runs.run_folder import write_atomically
 from goalgan_bt.viz.body import Bodies
+from goalgan_bt.viz.captions import caption, settings_rows, state
 from goalgan_bt.viz.curves import COLOURS, PLOTS, levels, series
 from goalgan_bt.viz.player import Player
 from goalgan_bt.viz.run import Frame, Run, places
 from goalgan_bt.viz.scene import LAYERS, Scene, legend, look_at
 from goalgan_bt.viz.server import start_server
-from goalgan_bt.viz.words import caption, settings_rows, state
 
 MOST_REPORTS = 300
 LENGTH = 30.0  # seconds in which all reports pass
@@ -82,7 +82,7 @@ def _last_policy(
     """Let the last policy go to some goals; yields the seconds and the caption of each."""
     try:
         player = Player(run.folder)
-    except (ConfigError, OSError, ValueError):
+    except (OSError, ValueError):
         return
     if not player.take_newest():
         return

@@ -11,7 +11,9 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 from rich.progress import track
 
-from goalgan_bt import record
+from goalgan_bt.runs import run_folder
+from goalgan_bt.runs.errors import RunError
+from goalgan_bt.runs.frames import frame_paths
 from goalgan_bt.viz import pictures
 
 PICTURES = 100  # of the run, evenly spread over its reports
@@ -30,9 +32,9 @@ def movie(folder: Path, path: Path) -> None:
         RunError: if the run has no maze or no report.
         OSError: if the file cannot be written.
     """
-    frames = record.frames(folder)
+    frames = frame_paths(folder)
     if not frames:
-        raise record.RunError(f"{folder} holds no report yet: wait for its first one")
+        raise RunError(f"{folder} holds no report yet: wait for its first one")
     picks = np.unique(np.linspace(0, len(frames) - 1, PICTURES).round().astype(int))
     images = [_picture(folder, frames[i]) for i in track(picks, "movie", transient=True)]
     images += [images[-1]] * HOLD
@@ -40,7 +42,7 @@ def movie(folder: Path, path: Path) -> None:
     if path.suffix.lower() == ".mp4":
         how = {"plugin": "pyav", "codec": "libx264", "fps": PER_SECOND}
     data = iio.imwrite("<bytes>", images, extension=path.suffix.lower(), **how)
-    record.write_atomically(path, lambda file: file.write(data))
+    run_folder.write_atomically(path, lambda file: file.write(data))
 
 
 def _picture(folder: Path, frame: Path) -> NDArray[np.uint8]:

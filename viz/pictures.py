@@ -10,8 +10,11 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from goalgan_bt import record
-from goalgan_bt.viz.published import Published, published
+from goalgan_bt.runs import run_folder
+from goalgan_bt.runs.errors import RunError
+from goalgan_bt.runs.frames import frame_paths, read_frame
+from goalgan_bt.runs.metrics_csv import read_metrics
+from goalgan_bt.study.published import Published, published
 from goalgan_bt.viz.run import Run, labels, places, success
 
 # Red (never reached) over pale yellow to blue (mastered): readable for colour-blind people.
@@ -31,16 +34,16 @@ def curve(ax: Axes, folders: list[Path], until: int | None = None) -> None:
     Raises:
         RunError: if a folder is no run, or some have coverage and others not.
     """
-    tables = [record.read_metrics(folder) for folder in folders]
+    tables = [read_metrics(folder) for folder in folders]
     covered = {"eval/coverage" in names or "eval/return" not in names for names, _ in tables}
     if len(covered) > 1:
-        raise record.RunError("some of these runs have a coverage, others a return: one at a time")
+        raise RunError("some of these runs have a coverage, others a return: one at a time")
     measure = "coverage" if covered == {True} else "return"
     references: dict[Published, None] = {}  # in the order given
     for i, (folder, (_, rows)) in enumerate(zip(folders, tables, strict=True)):
         rows = [row for row in rows if row.get(f"eval/{measure}")]
-        if not rows and record.maze_of(folder) is None:
-            raise record.RunError(f"{folder} holds no report yet: there is nothing to draw")
+        if not rows and run_folder.maze_of(folder) is None:
+            raise RunError(f"{folder} holds no report yet: there is nothing to draw")
         known = sum(until is None or int(row["iteration"]) <= until for row in rows)
         try:
             steps = [int(row["steps/train"]) for row in rows]
@@ -48,7 +51,7 @@ def curve(ax: Axes, folders: list[Path], until: int | None = None) -> None:
             if not all(map(math.isfinite, values)):
                 raise ValueError(f"a {measure} is not finite")
         except ValueError as error:
-            raise record.RunError(f"{folder / 'metrics.csv'} is damaged: {error}") from None
+            raise RunError(f"{folder / 'metrics.csv'} is damaged: {error}") from None
         values[known:] = [math.nan] * (len(rows) - known)
         run = Run(folder)
         ax.update_datalim([(x, 0.0) for x in steps], updatey=False)
@@ -88,10 +91,10 @@ def coverage_map(ax: Axes, folder: Path, frame: Path, goals: float = 7.0) -> Any
     Raises:
         RunError: if the folder is no run or its goals are not places in a maze.
     """
-    maze = record.maze_of(folder)
+    maze = run_folder.maze_of(folder)
     if maze is None:
-        raise record.RunError(f"{folder} has no maze to draw: only its curve can be plotted")
-    arrays = record.read_frame(frame)
+        raise RunError(f"{folder} has no maze to draw: only its curve can be plotted")
+    arrays = read_frame(frame)
     rate, measured = success(arrays)
     tiles = arrays["test_goals"]
     ax.set_facecolor("#55595f")
@@ -116,12 +119,12 @@ def coverage_map(ax: Axes, folder: Path, frame: Path, goals: float = 7.0) -> Any
 
 def measured_frames(folder: Path) -> list[Path]:
     """The frames that hold a measured coverage, oldest first."""
-    return [frame for frame in record.frames(folder) if success(record.read_frame(frame))[1]]
+    return [frame for frame in frame_paths(folder) if success(read_frame(frame))[1]]
 
 
 def frames_at(folder: Path, iterations: tuple[int, ...]) -> list[Path]:
     """The frames nearest to those iterations, measured or not."""
-    frames = record.frames(folder)
+    frames = frame_paths(folder)
     return [min(frames, key=lambda frame: abs(int(frame.stem) - i)) for i in iterations if frames]
 
 
@@ -137,16 +140,16 @@ def overview(folders: list[Path], maps: int = 4, at: tuple[int, ...] = ()) -> Fi
         RunError: if a folder is no run or holds no such report yet.
     """
     maps = len(at) or maps
-    with_maze = [folder for folder in folders if record.maze_of(folder) is not None]
+    with_maze = [folder for folder in folders if run_folder.maze_of(folder) is not None]
     if at and not with_maze:
-        raise record.RunError("--at chooses maps, and these runs have no maze to draw")
+        raise RunError("--at chooses maps, and these runs have no maze to draw")
     rows = len(with_maze)
     figure = Figure(figsize=(2.4 * maps, 2.6 * rows + 3.2), layout="constrained")
     grid = figure.add_gridspec(rows + 1, maps, height_ratios=[2.6] * rows + [3.2])
     for r, folder in enumerate(with_maze):
         frames = frames_at(folder, at) or measured_frames(folder)
         if not frames:
-            raise record.RunError(f"{folder} holds no report yet: wait for its first evaluation")
+            raise RunError(f"{folder} holds no report yet: wait for its first evaluation")
         picks = np.unique(np.linspace(0, len(frames) - 1, maps).round().astype(int))
         axes = [figure.add_subplot(grid[r, c]) for c in range(len(picks))]
         for ax, pick in zip(axes, picks, strict=True):

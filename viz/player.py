@@ -1,20 +1,20 @@
 """Episodes of a run's newest policy, in simulations of the view's own."""
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import torch
 
-from goalgan_bt import checkpoint, config
-from goalgan_bt.coverage import attempts
-from goalgan_bt.envs.batch import MujocoEnv
+from goalgan_bt.agent.coverage import attempts
+from goalgan_bt.agent.policy import GaussianPolicy
 from goalgan_bt.envs.maze import BoolArray, FloatArray
-from goalgan_bt.policy import GaussianPolicy
-from goalgan_bt.record import RunError, maze_of
-from goalgan_bt.train import make_env
+from goalgan_bt.envs.mujoco_env import MujocoEnv
+from goalgan_bt.learners.maze_learner import load_policy
+from goalgan_bt.learners.trained_policy import world_of
+from goalgan_bt.runs.errors import RunError
 
 
 @dataclass(frozen=True)
@@ -54,16 +54,14 @@ class Player:
         env: its simulations; iteration: of the policy, 0 while there is none.
 
     Raises:
-        ConfigError: if the run's settings cannot be read.
+        RunError: if the run's settings cannot be read.
     """
 
     def __init__(self, folder: Path, seed: int = 0) -> None:
         torch.set_num_threads(1)  # the trainer needs the cores
         self._folder = folder
-        # A run on mujoco-warp can be watched where there is none.
-        cfg = replace(config.load(folder), threads=1, physics="mujoco", device="auto")
-        maze = maze_of(folder)
-        self.env = make_env(cfg, len(make_env(cfg, 1, maze).test_goals()), maze)
+        goals = len(world_of(folder, 1)[1].test_goals())
+        cfg, self.env = world_of(folder, goals)
         self._policy = GaussianPolicy(self.env.obs_dim, self.env.act_dim, cfg.policy)
         self._tried: int | None = None  # the checkpoint last looked at, by its time
         self.iteration = 0
@@ -81,7 +79,7 @@ class Player:
             stamp = os.stat(path).st_mtime_ns
             if stamp != self._tried:
                 self._tried = stamp
-                self.iteration = checkpoint.load_policy(self._policy, self._folder)
+                self.iteration = load_policy(self._policy, self._folder)
         except (OSError, RunError):
             pass  # none yet, or another version: the last one will do
         return self.iteration > 0

@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from goalgan_bt import record
 from goalgan_bt.envs.maze import FloatArray
-from goalgan_bt.viz.metrics import Metrics
+from goalgan_bt.runs import run_folder
+from goalgan_bt.runs.errors import RunError
+from goalgan_bt.runs.frames import frame_paths, read_frame
+from goalgan_bt.runs.metrics_csv import Metrics
 
 Frame = dict[str, NDArray[Any]]
 REMEMBERED = 64  # frames kept in memory
@@ -40,12 +42,12 @@ class Run:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.name = folder, folder.resolve().name
-        self.maze = record.maze_of(folder)
+        self.maze = run_folder.maze_of(folder)
         try:
             settings = json.loads((folder / "config.json").read_text())
             self.env, self.settings = str(settings["env"]), dict(settings)
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
-            raise record.RunError(f"{folder} is no run: it has no readable config.json") from None
+            raise RunError(f"{folder} is no run: it has no readable config.json") from None
         self.iterations: list[int] = []
         self.metrics = Metrics(folder / "metrics.csv")
         self.gone = False
@@ -63,7 +65,7 @@ class Run:
             changed = (self.folder / "frames").stat().st_mtime_ns
             # The clock of a file system is coarse: of what has just changed, more may come.
             if changed != self._listed or time.time_ns() - changed < 2e9:
-                self.iterations = [int(path.stem) for path in record.frames(self.folder)]
+                self.iterations = [int(path.stem) for path in frame_paths(self.folder)]
                 self._listed = changed
         return self.metrics.refresh() or self.iterations != before
 
@@ -74,8 +76,8 @@ class Run:
             stamp = path.stat().st_mtime_ns  # a resumed run may write a frame anew
             known = self._frames.get(iteration)
             if known is None or known[0] != stamp:
-                self._frames[iteration] = stamp, record.read_frame(path)
-        except (OSError, record.RunError):
+                self._frames[iteration] = stamp, read_frame(path)
+        except (OSError, RunError):
             return self._frames[iteration][1] if iteration in self._frames else None
         self._frames.move_to_end(iteration)
         while len(self._frames) > REMEMBERED:
@@ -93,7 +95,7 @@ class Run:
     def ended(self) -> str | None:
         """How the run ended, or None while it goes on (or was killed without a word)."""
         try:
-            return (self.folder / record.ENDED).read_text()[:200].strip()
+            return (self.folder / run_folder.ENDED).read_text()[:200].strip()
         except (OSError, UnicodeDecodeError):
             return None
 

@@ -14,15 +14,15 @@ import numpy as np
 import viser
 
 from goalgan_bt.envs.maze import FloatArray
-from goalgan_bt.progress import complain
+from goalgan_bt.runs.terminal import complain
 from goalgan_bt.viz.body import Bodies
+from goalgan_bt.viz.captions import caption, plain, settings_table, state
 from goalgan_bt.viz.curves import Curves
 from goalgan_bt.viz.download import Export, as_csv
 from goalgan_bt.viz.player import Attempt, Player
 from goalgan_bt.viz.run import Frame, Run
 from goalgan_bt.viz.scene import LAYERS, Scene, drawn, legend, look_at
 from goalgan_bt.viz.server import start_server
-from goalgan_bt.viz.words import caption, plain, settings_table, state
 
 LOOK_EVERY = 1.0  # seconds between two looks at the run folders
 TICK = 1 / 25  # seconds between two pictures of the body

@@ -1,0 +1,130 @@
+"""Many MuJoCo simulations of one body, stepped at once, and what mazes share.
+
+The only place that knows `mujoco.batch`; `warp_batch` has its like for GPUs.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from goalgan_bt.envs.arrays import Array, put
+from goalgan_bt.envs.goal_env import GoalEnv, Ids
+from goalgan_bt.envs.maze import FloatArray, Maze
+
+
+class MujocoEnv(GoalEnv):
+    """A `GoalEnv` on MuJoCo; the state is qpos and qvel.
+
+    Args:
+        model: the compiled model.
+        num_envs: N.
+        horizon: steps of an episode.
+        action_repeat: steps for which each action is held.
+        threads: simulation threads, 0 for one per core. Results do not depend on it.
+        physics: `mujoco`, or `warp` for mujoco-warp in single precision (extra `gpu`).
+        device: of mujoco-warp: `cpu`, `cuda`, `cuda:1`, ...; `auto` is a GPU where there is one.
+
+    Raises:
+        PhysicsError: if mujoco-warp, the device or what the model needs of them is missing.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_envs: int,
+        horizon: int,
+        action_repeat: int,
+        threads: int,
+        physics: str,
+        device: str,
+    ) -> None:
+        super().__init__(num_envs, horizon, action_repeat)
+        self.model = model
+        self.batch, self._row = _batch(model, num_envs, threads, physics, device)
+        self._qpos, self._qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        self._ctrl = self.batch.bind("ctrl")
+        self.dt = model.opt.timestep
+
+    def read_states(self, ids: Ids) -> FloatArray:
+        return self._row[ids]
+
+    def write_states(self, ids: Ids, states: FloatArray) -> None:
+        # A reset also clears the solver's warm start, so that a state has one future only.
+        self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+        self._row[ids] = states
+
+    def advance(self, ids: Ids, actions: Array) -> None:
+        self._ctrl[ids] = put(actions, self._ctrl)
+        self.batch.step(ids, nstep=self.action_repeat)
+
+
+def _batch(
+    model: mujoco.MjModel, num_envs: int, threads: int, physics: str, device: str
+) -> tuple[Any, Any]:
+    """The simulations, and their states as rows of qpos and qvel."""
+    if physics == "warp":
+        from goalgan_bt.envs.warp_batch import WarpBatch
+
+        warp = WarpBatch(model, num_envs, device)
+        return warp, warp.rows
+    # A diverged simulation must end its episode, not be put back silently (Warp's never is).
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    batch = Batch(model, num_envs, threads)
+    # A state row of MuJoCo is time, qpos, qvel, ...: ours is a slice of it, read in one go.
+    rows = batch.state[:, 1 : 1 + model.nq + model.nv]
+    assert np.shares_memory(rows[:, : model.nq], batch.bind("qpos"))
+    return batch, rows
+
+
+class MazeEnv(MujocoEnv):
+    """A body in a maze, whose goals are places, (x, y) in metres.
+
+    Args:
+        maze: the layout.
+        integrator: `implicitfast` or `rk4`.
+        simulation: num_envs, horizon, action_repeat, threads, physics, device: see `MujocoEnv`.
+    """
+
+    maze: Maze
+    model_of: Callable[[Maze, str], mujoco.MjModel]  # the body in a maze, with that integrator
+
+    def __init__(self, maze: Maze, integrator: str, *simulation: Any) -> None:
+        self.maze = maze
+        self.goal_low, self.goal_high = maze.low, maze.high
+        super().__init__(self.model_of(maze, integrator), *simulation)
+
+    def feasible(self, goals: Array) -> Array:
+        return self.maze.is_free(goals)
+
+    def test_goals(self) -> FloatArray:
+        return self.maze.tiles()
+
+
+INTEGRATORS = {
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+}
+
+
+def add_walls(spec: mujoco.MjSpec, maze: Maze, height: float, collide: bool) -> None:
+    """Put the maze's walls into a model as boxes from the floor up.
+
+    Args:
+        spec: the model, changed in place.
+        maze: the layout.
+        height: of the walls, metres.
+        collide: whether MuJoCo's contacts stop bodies at the walls.
+    """
+    for i, (x0, y0, x1, y1) in enumerate(maze.walls()):
+        spec.worldbody.add_geom(
+            name=f"wall_{i}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=[(x0 + x1) / 2, (y0 + y1) / 2, height / 2],
+            size=[(x1 - x0) / 2, (y1 - y0) / 2, height / 2],
+            contype=int(collide),
+            conaffinity=int(collide),
+            rgba=[0.55, 0.58, 0.62, 1.0],
+        )

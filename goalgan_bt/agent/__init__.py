@@ -1,0 +1,1 @@
+"""The agent: a goal-conditioned Gaussian policy trained by TRPO."""

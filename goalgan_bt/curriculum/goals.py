@@ -1,0 +1,97 @@
+"""Goals: how hard they are for the present policy, which to keep, which to try next.
+
+A goal is of intermediate difficulty when r_min < p(success | goal) < r_max (Florensa et al. 2018,
+section 4.1). One update sees about two episodes per goal, so that counting successes per goal
+gives shares of 0, 1/2 or 1; the recent episodes to nearby goals estimate p instead
+(`SuccessEstimator`).
+"""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from goalgan_bt.curriculum.settings import GoalsConfig
+from goalgan_bt.envs.maze import BoolArray, FloatArray
+
+AT_ONCE = 1_000_000  # distances, so that many places visited cost time and not memory
+
+
+def intermediate(success: FloatArray, r_min: float, r_max: float) -> BoolArray:
+    """Whether goals are of intermediate difficulty: r_min < success < r_max, (n,) -> (n,).
+
+    Which policy the labels describe depends on where `success` comes from. From the
+    `SuccessEstimator` (the default) it is an average over the policies that made the last
+    `episodes` episodes. From fresh rollouts (`label_rollouts`) it is the policy before the last
+    of the iteration's updates (the original: after it).
+    """
+    return (success > r_min) & (success < r_max)
+
+
+class GoalMemory:
+    """Goals, each at some distance from all others.
+
+    One holds the goals that once were of intermediate difficulty: replaying them keeps the policy
+    from forgetting (Florensa et al. 2018, section 4.3). Another holds where the agent has been.
+    """
+
+    def __init__(self, goal_dim: int, distance: float) -> None:
+        self.goals = np.empty((0, goal_dim))
+        self.distance = distance
+
+    def __len__(self) -> int:
+        return len(self.goals)
+
+    def add(self, goals: FloatArray) -> None:
+        """Keep those of the goals (n, goal_dim) that are far enough from all that is kept."""
+        for goal in goals:
+            if (np.linalg.norm(self.goals - goal, axis=1) > self.distance).all():
+                self.goals = np.append(self.goals, goal[None], axis=0)
+
+    def distance_to(self, goals: FloatArray) -> FloatArray:
+        """From each goal (n, goal_dim) to the nearest one kept, (n,); infinite if none is."""
+        if len(self.goals) == 0:
+            return np.full(len(goals), np.inf)
+        rows = max(1, AT_ONCE // len(self.goals))
+        some = (goals[i : i + rows] for i in range(0, len(goals), rows))
+        nearest = [np.linalg.norm(g[:, None] - self.goals, axis=2).min(axis=1) for g in some]
+        return np.concatenate([*nearest, np.empty(0)])
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """At most n different goals, (<= n, goal_dim)."""
+        return self.goals[rng.permutation(len(self.goals))[:n]]
+
+
+class SuccessEstimator:
+    """p(success | goal) from the start: the share of successes among the nearest recent episodes.
+
+    It costs no environment step, uses every episode from the start, follows the policy as fast as
+    episodes end, and is a coverage map between evaluations.
+    """
+
+    def __init__(self, goal_dim: int, cfg: GoalsConfig) -> None:
+        self.cfg = cfg
+        self.goals = np.empty((0, goal_dim))
+        self.success = np.empty(0)
+
+    def add(self, goals: FloatArray, success: FloatArray | BoolArray) -> None:
+        """Remember finished episodes: goals (n, goal_dim) and whether each was reached, (n,)."""
+        self.goals = np.concatenate([self.goals, goals])[-self.cfg.episodes :]
+        self.success = np.concatenate([self.success, success])[-self.cfg.episodes :]
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The episodes that it remembers."""
+        return {"goals": torch.from_numpy(self.goals), "success": torch.from_numpy(self.success)}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take over what `state_dict` gave."""
+        self.goals, self.success = (state[name].numpy().copy() for name in ("goals", "success"))
+
+    def __call__(self, goals: FloatArray) -> FloatArray:
+        """Estimated success, (n, goal_dim) -> (n,) in [0, 1]; NaN while nothing is known."""
+        k = self.cfg.neighbours
+        if len(self.goals) < k:
+            return np.full(len(goals), np.nan)
+        # The squared distance less |goal|^2, which is the same for all of a row.
+        distance = np.square(self.goals).sum(axis=1) - 2 * goals @ self.goals.T
+        nearest = np.argpartition(distance, k - 1, axis=1)[:, :k]
+        return np.asarray(self.success[nearest].mean(axis=1))

@@ -1,0 +1,214 @@
+"""The settings of a maze run: those of each part, composed, and a preset per environment."""
+
+import math
+import os
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+from goalgan_bt import envs
+from goalgan_bt.agent.settings import (
+    CoverageConfig,
+    PolicyConfig,
+    RolloutConfig,
+    TrpoConfig,
+    ValueConfig,
+)
+from goalgan_bt.curriculum.settings import GanConfig, GoalsConfig
+from goalgan_bt.envs.goal_env import GoalEnv
+from goalgan_bt.envs.maze import Maze
+from goalgan_bt.learners.methods import METHODS
+from goalgan_bt.learners.run_config import RunConfig
+from goalgan_bt.recall.settings import BacktrackingConfig, ImitationConfig, too_much
+from goalgan_bt.runs.errors import UsageError
+from goalgan_bt.runs.ranges import ABOVE_ZERO, NOT_NEGATIVE, SHARE, Range
+from goalgan_bt.runs.run_folder import maze_of
+
+
+@dataclass(frozen=True)
+class MazeConfig(RunConfig):
+    """Learn to reach every free point of a maze: Goal GAN, recall traces, TRPO. The defaults shown
+    are those of the environment given with --env, or of ant_umaze."""
+
+    env: str = "ant_umaze"
+    """Environment: {point,ant}_{umaze,spiral,medium,large} or point_nd. Picks the preset."""
+    method: str = "recall_traces"
+    """What to learn with: recall_traces, or one of the baselines and controls of methods.py. Picks
+    settings; other flags come on top."""
+    resume: Path | None = None
+    """Go on with this run (its folder): its settings are the defaults, and its limits, which count
+    from its beginning, hold unless others are given. With later limits the exploration noise goes
+    back up to where it would be in so long a run."""
+    iterations: Annotated[int | None, ABOVE_ZERO] = None
+    """Stop after this many iterations."""
+    minutes: Annotated[float | None, ABOVE_ZERO] = None
+    """Stop after this much wall time, minutes. What anneals then follows the clock, so that a seed
+    alone does not repeat the run."""
+    map: Path | None = None
+    """Text map that replaces the maze: '#' wall, '.' free, 'S' start."""
+    dim: Annotated[int, Range("2 to 6", 2, 6)] = 2
+    """Dimensions of point_nd, 2 to 6."""
+    horizon: Annotated[int | None, ABOVE_ZERO] = None
+    """Steps of an episode; by default 200 (point) or 500 (ant), more in longer mazes."""
+    integrator: Literal["implicitfast", "rk4"] = "implicitfast"
+    """MuJoCo's integrator; rk4 is the original's and costs four times as much."""
+    physics: Literal["mujoco", "warp"] = "mujoco"
+    """What simulates: MuJoCo on the CPU, or mujoco-warp, in single precision (extra `gpu`)."""
+    device: str = "auto"
+    """Where mujoco-warp runs: cpu, cuda, cuda:1, ...; auto is a GPU where there is one."""
+    action_repeat: Annotated[int, ABOVE_ZERO] = 1
+    """Steps of 0.02 s for which the policy holds each action (the original: 1)."""
+    threads: Annotated[int, NOT_NEGATIVE] = 0
+    """Simulation threads of each process; 0 is one per core."""
+    learning_threads: Annotated[int, ABOVE_ZERO] = 1
+    """Threads of torch. More than one pays only on idle cores: they wait for each other busily."""
+    discount: Annotated[float, SHARE] = 0.995
+    """Discount factor per action (the original: 0.99)."""
+    gae_lambda: Annotated[float, SHARE] = 0.95
+    """Lambda of generalised advantage estimation (the original: 1)."""
+    updates: Annotated[int, ABOVE_ZERO] = 1
+    """Policy updates per iteration (the original: 5)."""
+    report_every: Annotated[int, ABOVE_ZERO] = 1
+    """Iterations between two reports (a line on the terminal, a frame in the run folder)."""
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    value: ValueConfig = field(default_factory=ValueConfig)
+    rollout: RolloutConfig = field(default_factory=RolloutConfig)
+    goals: GoalsConfig = field(default_factory=GoalsConfig)
+    gan: GanConfig = field(default_factory=GanConfig)
+    trpo: TrpoConfig = field(default_factory=TrpoConfig)
+    backtracking: BacktrackingConfig = field(default_factory=BacktrackingConfig)
+    imitation: ImitationConfig = field(default_factory=ImitationConfig)
+    coverage: CoverageConfig = field(default_factory=CoverageConfig)
+
+    @property
+    def num_threads(self) -> int:
+        """Threads, with 0 resolved to this process's share of the cores that it may use."""
+        processes = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))  # torchrun's, on this machine
+        return self.threads or max(1, len(os.sched_getaffinity(0)) // processes)
+
+
+# What a resumed run may change: another world or other randomness would be another run.
+FIXED = {"env", "method", "seed", "map", "dim", "horizon", "action_repeat", "integrator"}
+MAY_CHANGE = frozenset(field.name for field in fields(MazeConfig)) - FIXED - {"physics", "out"}
+
+ANT = MazeConfig(
+    env="ant_umaze",
+    total_steps=12_000_000,
+    action_repeat=2,
+    discount=0.993,
+    updates=4,
+    policy=PolicyConfig(init_std=0.2, final_std=0.07),
+    rollout=RolloutConfig(num_envs=256, steps=50),
+    gan=GanConfig(steps=50, generator_hidden=(128, 128)),
+    backtracking=BacktrackingConfig(trace_length=50),
+    imitation=ImitationConfig(steps=10, learning_rate=5e-5, max_kl=0.003, fade=0.3),
+)
+POINT = MazeConfig(
+    env="point_umaze",
+    total_steps=4_000_000,
+    action_repeat=4,
+    discount=0.97,
+    updates=8,
+    policy=PolicyConfig(input_gain=3.0, init_std=1.0, final_std=0.3),
+    value=ValueConfig(input_gain=3.0, minibatch=128),
+    rollout=RolloutConfig(num_envs=64, steps=20),
+    goals=GoalsConfig(old=40, r_min=0.05),
+    trpo=TrpoConfig(max_kl=0.015),
+    backtracking=BacktrackingConfig(trace_length=20),
+    imitation=ImitationConfig(steps=40, max_kl=0.05, fade=0.15),
+    coverage=CoverageConfig(rollouts=2, every=250_000),
+)
+
+
+def preset(env: str, method: str | None = None) -> MazeConfig:
+    """The default settings for an environment and a method.
+
+    Raises:
+        UsageError: if there is no such environment or method.
+    """
+    if env not in envs.NAMES:
+        raise UsageError(f"unknown environment {env!r}: choose one of {', '.join(envs.NAMES)}")
+    cfg = replace(ANT if env.startswith("ant") else POINT, env=env)
+    if env == "point_nd":
+        # The box is 0.6 m thin: among its neighbours' outcomes a goal's own is lost, and noise
+        # throws it out of the box. No walls to be misled by: `near` is not needed.
+        goals = replace(cfg.goals, near=math.inf, label_rollouts=3, old=100, anywhere=0.1)
+        cfg = replace(cfg, goals=goals, gan=replace(cfg.gan, goal_noise=0.1, steps=100))
+    return cfg if method is None else with_method(cfg, method)
+
+
+def with_method(cfg: MazeConfig, method: str) -> MazeConfig:
+    """The same with the settings of a method.
+
+    Raises:
+        UsageError: if there is no such method.
+    """
+    if method not in METHODS:
+        raise UsageError(f"unknown method {method!r}: choose one of {', '.join(METHODS)}")
+    for name, value in METHODS[method].items():
+        part, key = name.split(".")
+        cfg = replace(cfg, **{part: replace(getattr(cfg, part), **{key: value})})
+    return replace(cfg, method=method)
+
+
+def check(cfg: MazeConfig) -> None:
+    """Refuse settings that make no sense.
+
+    Raises:
+        UsageError: naming the first such setting.
+    """
+    with_method(cfg, cfg.method)  # is there such a one?
+    most = 8 * len(os.sched_getaffinity(0))
+    if cfg.threads > most:
+        raise UsageError(f"--threads must be at most {most} on this machine, not {cfg.threads}")
+    if cfg.policy.final_std is not None and cfg.policy.final_std < cfg.policy.min_std:
+        raise UsageError("--policy.final-std must not be less than --policy.min-std")
+    if cfg.goals.neighbours > cfg.goals.episodes:
+        raise UsageError("--goals.neighbours must not be more than --goals.episodes")
+    if cfg.backtracking.min_transitions > cfg.backtracking.buffer:
+        raise UsageError(
+            "--backtracking.min-transitions must not be more than --backtracking.buffer"
+        )
+    if problem := too_much(cfg.backtracking.trace_length, cfg.backtracking.traces):
+        raise UsageError(f"--backtracking: {problem}")
+    if cfg.horizon is not None and cfg.horizon % cfg.action_repeat:
+        raise UsageError("--horizon must be a multiple of --action-repeat")
+    if cfg.map is not None and cfg.env == "point_nd":
+        raise UsageError("point_nd has no walls: --map goes with point_... and ant_... mazes")
+    if cfg.physics == "warp" and cfg.env == "point_nd":
+        raise UsageError(
+            "point_nd is no MuJoCo model: --physics warp goes with point_... and ant_..."
+        )
+    if cfg.device != "auto" and cfg.physics != "warp":
+        raise UsageError("--device is mujoco-warp's: it goes with --physics warp")
+    if cfg.dim != 2 and cfg.env != "point_nd":
+        raise UsageError(f"--dim goes with point_nd: {cfg.env} has two dimensions")
+    if cfg.goals.source == "gan_fit_all" and cfg.goals.near == math.inf:
+        raise UsageError("gan_fit_all needs to know the places visited: give a finite --goals.near")
+    if cfg.goals.r_min >= cfg.goals.r_max:
+        raise UsageError("--goals.r-min must be less than --goals.r-max")
+
+
+def make_env(cfg: MazeConfig, num_envs: int, maze: Maze | None = None) -> GoalEnv:
+    """The environment that the settings name, in another maze if one is given. A run that goes on
+    does so in the maze that its folder has recorded: a map's file may be another by now, or gone.
+
+    Raises:
+        MapError: for a map that is not a maze.
+        RunError: if the maze that was recorded cannot be read.
+    """
+    if maze is None and cfg.resume is not None:
+        maze = maze_of(cfg.resume)
+    return envs.make(
+        cfg.env,
+        num_envs,
+        threads=cfg.num_threads,
+        horizon=cfg.horizon,
+        action_repeat=cfg.action_repeat,
+        integrator=cfg.integrator,
+        dim=cfg.dim,
+        map_file=cfg.map,
+        maze=maze,
+        physics=cfg.physics,
+        device=cfg.device,
+    )

@@ -1,0 +1,542 @@
+"""Recall traces for those agents of Stable-Baselines3 and sb3-contrib that have a Gaussian policy:
+SAC, TRPO, PPO and A2C (extra `sb3`).
+
+    from stable_baselines3 import SAC
+    from goalgan_bt.sb3 import RecallConfig, RecallTraces
+    recall = RecallTraces(RecallConfig(max_kl=0.2))  # the default suits TRPO and PPO
+    SAC("MlpPolicy", "Hopper-v5").learn(200_000, callback=recall)
+
+Goyal et al. 2019, Algorithm 1 with Algorithm 2: the best trajectories teach a backtracking model,
+which is unrolled from the most valuable states; the policy imitates those traces. The state is the
+observation: the environment need know nothing of us.
+"""
+
+import time
+from collections import deque
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.sac.policies import SACPolicy
+from torch import Tensor
+from torch.distributions import Normal, kl_divergence
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
+
+from goalgan_bt.agent.rollout import Float32
+from goalgan_bt.agent.trpo import line_search
+from goalgan_bt.envs.maze import BoolArray, FloatArray
+from goalgan_bt.recall.backtracking import BacktrackingModel
+from goalgan_bt.recall.forward import ForwardModel
+from goalgan_bt.recall.imitation import faded
+from goalgan_bt.recall.settings import BacktrackingConfig, RecallConfig
+from goalgan_bt.recall.traces import recall_traces
+from goalgan_bt.runs import checkpoint
+from goalgan_bt.runs.signals import Stop
+
+EDGE = 0.999  # of the range of a squashed action, beyond which its inverse is taken as there
+MOST = 5.0  # standard deviations from the mean at which a number of an observation is cut off
+FAR = 3.0  # root mean square of the standard deviations from what was seen at which a trace ends
+WAYS = 4  # that a forward model imagines from a state; the best is imitated
+HALVINGS = 10  # of a step of imitation that is too long
+KL_SAMPLE = 1024  # states on which the KL of an imitation is bounded
+
+
+class Trajectory(NamedTuple):
+    """One episode: observations as the environment gave them (T + 1, obs_dim), actions
+    (T, act_dim) in [-1, 1], rewards (T,), and whether its last state ended it, or time ran out."""
+
+    obs: FloatArray
+    actions: FloatArray
+    rewards: FloatArray
+    terminated: bool
+
+
+class Seen:
+    """The observations of an agent as states: valid is what is not far from those seen. Numbers
+    far out are cut off: contact forces, zero nearly always, would break the model."""
+
+    def __init__(self, obs: FloatArray, act_dim: int) -> None:
+        self.state_dim, self.act_dim = obs.shape[1], act_dim
+        self._mean, self._std = obs.mean(axis=0), obs.std(axis=0) + 1e-3
+        self._low, self._high = self._mean - MOST * self._std, self._mean + MOST * self._std
+
+    def repair(self, states: FloatArray) -> FloatArray:
+        """The same with numbers far out cut off."""
+        return np.clip(states, self._low, self._high)
+
+    def valid(self, states: FloatArray) -> BoolArray:
+        """Whether each state (n, state_dim) is finite and not far away, (n,)."""
+        away = np.square((states - self._mean) / self._std).mean(axis=1)
+        return np.asarray(np.isfinite(away) & (away < FAR**2))
+
+
+class Until(BaseCallback):
+    """Ends `learn` as soon as somebody wants a run to stop."""
+
+    def __init__(self, stop: Stop | None) -> None:
+        super().__init__()
+        self._stop = stop
+
+    def _on_step(self) -> bool:
+        return self._stop is None or not self._stop.requested
+
+
+class RecallTraces(BaseCallback):
+    """Lets an agent imitate recall traces while it learns. It may be given to `learn` again, and
+    saved and loaded beside the agent.
+
+    Args:
+        cfg: settings.
+        seed: of the model and the traces.
+        verbose: as of every callback.
+
+    Attributes:
+        trajectories: what is remembered, the newest last; dynamics: the backtracking model (or the
+            forward one, see `RecallConfig.model`), once learning has begun; last: what the last
+            turn gave (see `turn`); seconds: what all of it took, the turns and what is remembered
+            at each step.
+
+    Raises:
+        ValueError: for settings that make no sense.
+        ValueError: when learning begins, if what is remembered is of another task's sizes.
+        TypeError: when learning begins, if the agent's policy is no Gaussian (without memory or
+            state-dependent exploration), its observations or actions are not vectors, or they are
+            wrapped once more after they have been normalised.
+    """
+
+    def __init__(self, cfg: RecallConfig | None = None, seed: int = 0, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        self.cfg = cfg or RecallConfig()
+        if problem := self.cfg.problem():
+            raise ValueError(problem)
+        self.trajectories: deque[Trajectory] = deque()
+        self.dynamics: BacktrackingModel | ForwardModel | None = None
+        self._seed = seed
+        self._rng, self._noise = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
+        self._remembered, self._turned = 0, 0
+        self._moments: dict[str, Any] | None = None  # of a saved optimiser
+        self._agent: Any = None  # whose policy the optimiser is for
+        self._sizes = (0, 0)  # of observations and actions of the model
+        self._now: FloatArray = np.empty(0)  # observations before the next step
+        self._learning = False  # until `learn` has come to its end
+        self.last: dict[str, float] = {}
+        self.seconds = 0.0
+
+    def _new_model(self, obs_dim: int, act_dim: int) -> BacktrackingModel | ForwardModel:
+        self._sizes = obs_dim, act_dim
+        cfg = BacktrackingConfig(batch=256, steps=self.cfg.model_steps)
+        with torch.random.fork_rng(devices=[]):  # the agent's own noise stays as it would be alone
+            torch.manual_seed(self._seed)
+            if self.cfg.model == "forward":
+                return ForwardModel(obs_dim, act_dim, cfg, self._noise)
+            return BacktrackingModel(obs_dim, act_dim, cfg=cfg, generator=self._noise)
+
+    def _init_callback(self) -> None:
+        policy: Any = self.model.policy
+        space, actions = self.model.observation_space, self.model.action_space
+        known = isinstance(policy, (ActorCriticPolicy, SACPolicy))
+        if not known or hasattr(policy, "lstm_actor") or self.model.use_sde:
+            raise TypeError(
+                "RecallTraces needs an agent with a Gaussian policy, without memory or "
+                "state-dependent exploration: SAC, TRPO, PPO or A2C"
+            )
+        if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
+            raise TypeError(f"RecallTraces needs observations that are vectors, not {space}")
+        if not (isinstance(actions, spaces.Box) and len(actions.shape) == 1):
+            raise TypeError(f"RecallTraces needs actions that are vectors of numbers: {actions}")
+        if not (actions.high > actions.low).all():
+            raise TypeError(f"RecallTraces needs actions that can vary in every number: {actions}")
+        self._squashed = isinstance(policy, SACPolicy)
+        self._learner = policy.actor if self._squashed else policy
+        self._low, self._high = actions.low.astype(float), actions.high.astype(float)
+        sizes = space.shape[0], actions.shape[0]
+        if self.dynamics is None or (sizes != self._sizes and not self.trajectories):
+            self.dynamics = self._new_model(*sizes)
+        if sizes != self._sizes:
+            raise ValueError(
+                f"this RecallTraces remembers observations and actions of {self._sizes} numbers, "
+                f"the agent's have {sizes}: take a new one"
+            )
+        if self._agent is not self.model:
+            self._agent, self._turned = self.model, self.model.num_timesteps
+            self._optimiser = torch.optim.Adam(self._learner.parameters(), self.cfg.learning_rate)
+            self._paths: list[list[tuple[Any, Any, float]]] = [[] for _ in range(self.model.n_envs)]
+            self._whole = np.zeros(self.model.n_envs, dtype=bool)  # seen from their beginning
+        if self._moments is not None and _fit(self._moments, self._optimiser):
+            checkpoint.restore(self._optimiser, self._moments)
+        self._moments = None
+
+    def _on_training_start(self) -> None:
+        self._normalising = self.model.get_vec_normalize_env()
+        begin, anew = self._original(self.model._last_obs), self.locals["reset_num_timesteps"]
+        expected = self.model.observation_space.shape
+        if begin.shape[1:] != expected:
+            raise TypeError(
+                f"RecallTraces cannot see the observations {expected} of the agent before they are "
+                f"normalised, only {begin.shape[1:]}: let VecNormalize be the outermost wrapper"
+            )
+        if anew:
+            self._turned = 0
+        anew = anew or not self.model.num_timesteps
+        if anew or self._learning or not np.array_equal(begin, self._now):
+            # The environments have been reset, or went on without us, for a step perhaps where
+            # `learn` did not come to its end: what they are in the middle of is not remembered.
+            for path in self._paths:
+                path.clear()
+            self._whole[:] = anew
+        self._now, self._learning = begin, True
+
+    def _on_training_end(self) -> None:
+        self._learning = False
+
+    def _original(self, obs: Any) -> FloatArray:
+        """The last observations as the environments gave them: what an agent that normalises has
+        seen would look different by the time that it is recalled."""
+        known = obs if self._normalising is None else self._normalising.get_original_obs()
+        return np.array(known)
+
+    def _normalised(self, obs: FloatArray) -> FloatArray:
+        """Observations (n, obs_dim) as the agent sees them at present."""
+        if self._normalising is None:
+            return obs
+        return np.asarray(self._normalising.normalize_obs(obs))
+
+    def _on_step(self) -> bool:
+        begin = time.perf_counter()
+        given = self.locals
+        actions = given.get("clipped_actions", given["actions"])
+        told = self._told(actions)
+        normalising, rewards = self._normalising, given["rewards"]
+        if normalising is not None:
+            rewards = normalising.get_original_reward()
+        for i, path in enumerate(self._paths):
+            path.append((self._now[i], told[i], float(rewards[i])))
+            if not given["dones"][i]:
+                continue
+            if self._whole[i]:
+                info = given["infos"][i]
+                last, timeout = info["terminal_observation"], info.get("TimeLimit.truncated", False)
+                if normalising is not None:
+                    last = normalising.unnormalize_obs(last)
+                self._remember(path, last, not timeout)
+            path.clear()
+            self._whole[i] = True
+        self._now = self._original(given["new_obs"])
+        self.seconds += time.perf_counter() - begin
+        return True
+
+    def _remember(
+        self, path: list[tuple[Any, Any, float]], last_obs: FloatArray, terminated: bool
+    ) -> None:
+        obs, actions, rewards = map(np.array, zip(*path, strict=True))
+        ended = Trajectory(np.concatenate([obs, last_obs[None]]), actions, rewards, terminated)
+        self.trajectories.append(ended)
+        self._remembered += len(path)
+        while self._remembered - len(self.trajectories[0].rewards) >= self.cfg.capacity:
+            self._remembered -= len(self.trajectories.popleft().rewards)
+
+    def _on_rollout_start(self) -> None:
+        # The agent has just learned, and what it collects next is collected by the policy as it
+        # will be then: the moment to change it.
+        if self.num_timesteps - self._turned >= self.cfg.every:
+            self._turned = self.num_timesteps
+            begin = time.perf_counter()
+            self.last = self.turn() if self.max_kl() > 0 else {}
+            for name, value in self.last.items():
+                self.logger.record(f"recall/{name}", value)
+            self.seconds += time.perf_counter() - begin
+            self.logger.record("recall/seconds", self.seconds)
+
+    def max_kl(self) -> float:
+        """The bound on the KL at present, nats."""
+        return faded(self.cfg.max_kl, self.num_timesteps, self.cfg.fade_steps)
+
+    def best(self) -> tuple[list[Trajectory], float]:
+        """The trajectories whose return is in the top percent, and the lowest of those returns. The
+        lowest of all is never among them: where few reach a goal, it is what all others get."""
+        returns = np.array([trajectory.rewards.sum() for trajectory in self.trajectories])
+        if not len(returns) or returns.min() == returns.max():
+            return [], np.nan  # none is better than another
+        most = max(1, round(len(returns) * self.cfg.top_percent / 100))
+        threshold = max(np.sort(returns)[-most], returns[returns > returns.min()].min())
+        chosen = zip(self.trajectories, returns, strict=True)
+        return [one for one, total in chosen if total >= threshold], float(threshold)
+
+    def turn(self) -> dict[str, float]:
+        """One turn of Algorithm 1 besides the agent's own: train the model, recall, imitate.
+
+        Returns:
+            threshold: L; length, best_length: mean actions of all remembered trajectories, and of
+            those that teach; action_nll, state_nll, or forward_nll: see the models; valid: share
+            of the steps of the traces before they ended; loss, kl, log_pi: see `_imitate`;
+            log_ratio: log pi(a | s) - log q(a | s') before it, nats per step: of the paper's lower
+            bound of log p(R > L) (section 4) the part that is known; the world's transitions are
+            not. Nothing while there is too little to learn from.
+        """
+        chosen, threshold = self.best()
+        total = sum(len(one.rewards) for one in chosen)
+        if total < self.cfg.min_steps:
+            return {}
+        states, following = (
+            self._normalised(np.concatenate([one.obs[rows] for one in chosen]))
+            for rows in (slice(-1), slice(1, None))
+        )
+        actions = np.concatenate([one.actions for one in chosen])
+        rewards = np.concatenate([one.rewards for one in chosen])
+        if self._normalising is not None:  # as the critic's
+            rewards = self._normalising.normalize_reward(rewards)
+        lengths = {
+            "length": float(np.mean([len(one.rewards) for one in self.trajectories])),
+            "best_length": total / len(chosen),
+        }
+        space = Seen(states, actions.shape[1])
+        known, after = space.repair(states), space.repair(following)
+        model = self.dynamics
+        assert model is not None
+        metrics = {"threshold": threshold, **lengths, **model.fit(known, actions, after)}
+        if isinstance(model, ForwardModel):
+            told, done, valid = self._imagine(model, space, known)
+            metrics["valid"] = float(valid.mean())
+            return metrics | (self._imitate(told, done, states) if len(told) else {})
+
+        worth = rewards
+        if self.cfg.seeds == "value":  # of reaching a state: where it ends, nothing follows
+            ends = np.cumsum([len(one.rewards) for one in chosen]) - 1
+            future = self._values(following)
+            future[ends[[one.terminated for one in chosen]]] = 0.0
+            worth = rewards + self._agent.gamma * future
+        seeds = after[np.argsort(worth)[-self.cfg.traces :]].astype(float)
+        traces = recall_traces(
+            model, seeds, self.cfg.trace_length, valid=space.valid, repair=space.repair
+        )
+        metrics["valid"] = float(traces.valid.mean())
+        if traces.valid.any():
+            later = np.concatenate([seeds[None], traces.states[:-1]])[traces.valid]
+            recalled = traces.states[traces.valid], traces.actions[traces.valid]
+            happened = (torch.from_numpy(x).float() for x in (later, recalled[1]))
+            log_q = model.action_log_density(*happened).mean().item()
+            metrics |= self._imitate(*recalled, states)
+            metrics["log_ratio"] = metrics["log_pi"] - log_q
+        return metrics
+
+    def _imagine(
+        self, model: ForwardModel, space: Seen, states: FloatArray
+    ) -> tuple[Float32, Float32, BoolArray]:
+        """Let the policy act in a forward model, `WAYS` times from each of some of the states
+        (m, obs_dim). The best is kept of those that have the same beginning: otherwise it would be
+        the beginnings that are chosen.
+
+        Returns:
+            States and actions in [-1, 1] of those that end best, (n, obs_dim), (n, act_dim); which
+            of all steps were valid, (trace_length, WAYS * traces).
+        """
+        begins = states[self._rng.integers(len(states), size=self.cfg.traces)]
+        now = np.tile(begins, (WAYS, 1))
+        told = np.empty((self.cfg.trace_length, *now.shape), np.float32)
+        done = np.empty((*told.shape[:2], space.act_dim), np.float32)
+        valid = np.empty(told.shape[:2], dtype=bool)
+        going = np.ones(len(now), dtype=bool)
+        for t in range(self.cfg.trace_length):
+            told[t], done[t] = now, self._sample(now)
+            following = model.successors(*map(torch.from_numpy, (told[t], done[t]))).numpy()
+            going &= space.valid(following)
+            valid[t] = going
+            now = np.where(going[:, None], space.repair(following), now)
+        worth = self._values(now).reshape(WAYS, -1)
+        best = np.arange(WAYS)[:, None] == worth.argmax(axis=0)
+        kept = valid & best.ravel()
+        return told[kept], done[kept], valid
+
+    def _gaussian(self, obs: Tensor) -> Normal:
+        """The policy before it is squashed or clipped."""
+        if self._squashed:
+            mean, log_std, _ = self._learner.get_action_dist_params(obs)
+            return Normal(mean, log_std.exp())
+        found = self._learner.get_distribution(obs).distribution
+        assert isinstance(found, Normal)
+        return found
+
+    @torch.no_grad()
+    def _sample(self, obs: FloatArray) -> FloatArray:
+        """Actions of the policy at observations (n, obs_dim), (n, act_dim) in [-1, 1]."""
+        found = self._gaussian(self._tensor(obs))
+        noise = self._tensor(torch.randn(found.mean.shape, generator=self._noise).numpy())
+        actions = (found.mean + found.stddev * noise).cpu().numpy()
+        return np.tanh(actions) if self._squashed else self._told(actions).clip(-1, 1)
+
+    def _told(self, actions: FloatArray) -> FloatArray:
+        """Actions of the environment's range in [-1, 1]."""
+        return 2 * (actions - self._low) / (self._high - self._low) - 1
+
+    def _tensor(self, array: FloatArray) -> Tensor:
+        return torch.as_tensor(array, dtype=torch.float32, device=self.model.device)
+
+    @torch.no_grad()
+    def _values(self, obs: FloatArray) -> FloatArray:
+        """What the critic says of observations (n, obs_dim), (n,)."""
+        told, policy = self._tensor(obs), cast(Any, self.model.policy)
+        if self._squashed:
+            judged = policy.critic(told, policy.actor(told, deterministic=True))
+            return torch.cat(judged, dim=1).amin(dim=1).cpu().numpy()
+        return policy.predict_values(told)[:, 0].cpu().numpy()
+
+    def _imitate(
+        self,
+        states: FloatArray,
+        actions: FloatArray,
+        seen: FloatArray,
+    ) -> dict[str, float]:
+        """Maximise log pi(a | s) of recalled steps. The gradient goes through the mean only; the
+        std of SAC's policy, which shares layers with the mean, may follow.
+
+        Args:
+            states, actions: (n, obs_dim), (n, act_dim) in [-1, 1].
+            seen: (m, obs_dim) states on which the KL is bounded.
+
+        Returns:
+            loss: -log pi, nats; kl: on those states; log_pi: log pi(a | s) before the imitation,
+            nats per step.
+        """
+        obs, goals = self._tensor(states), self._tensor(actions)
+        if self._squashed:
+            goals = torch.atanh(goals.clamp(-EDGE, EDGE))
+            slope = -torch.log1p(-torch.tanh(goals).square())  # of atanh
+        else:
+            half = self._tensor((self._high - self._low) / 2)
+            goals = self._tensor(self._low) + half * (goals + 1)
+            slope = half.log().expand_as(goals)
+        rows = self._rng.permutation(len(seen))[:KL_SAMPLE]
+        reference = self._tensor(seen[rows])
+        with torch.no_grad():
+            old, before = self._gaussian(reference), self._gaussian(obs)
+            log_pi = (before.log_prob(goals) + slope).sum(dim=1).mean().item()
+        max_kl = self.max_kl()
+        loss, kl, params = np.nan, 0.0, list(self._learner.parameters())
+
+        @torch.no_grad()
+        def evaluate(candidate: Tensor) -> tuple[float, float]:
+            vector_to_parameters(candidate, params)
+            new_kl = kl_divergence(old, self._gaussian(reference)).sum(dim=1).mean()
+            return 1.0, new_kl.item()  # any step is taken that is short enough
+
+        for step in range(self.cfg.imitation_steps):
+            some = torch.from_numpy(self._rng.integers(len(obs), size=self.cfg.imitation_batch))
+            found = self._gaussian(obs[some])
+            std = found.stddev.detach()
+            miss = -Normal(found.mean, std).log_prob(goals[some]).sum(dim=1).mean()
+            if step == 0:
+                loss = miss.item()
+            start = parameters_to_vector(params).detach()
+            self._optimiser.zero_grad()
+            miss.backward()
+            self._optimiser.step()
+            full_step = parameters_to_vector(params).detach() - start
+            accepted = None  # for a policy as narrow as SAC's nearly every full step is too long
+            if torch.isfinite(full_step).all():
+                accepted = line_search(evaluate, start, full_step, max_kl, HALVINGS + 1, 0.5)
+            if accepted is None:
+                vector_to_parameters(start, params)
+                break
+            there, _, kl = accepted  # and in place: the last that was tried
+            if not torch.equal(there, start + full_step):
+                break  # shortened: it has reached the bound
+        return {"loss": loss, "kl": kl, "log_pi": log_pi}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Settings, model and trajectories, to go on with a saved agent.
+
+        Raises:
+            ValueError: if no episode has ended yet.
+        """
+        if self.dynamics is None or not self.trajectories:
+            raise ValueError("nothing was learned yet: save after the first episode of `learn`")
+        moments = self._optimiser.state_dict() if self._agent is not None else self._moments
+        return {
+            "cfg": asdict(self.cfg),
+            "model": self.dynamics.state_dict(),
+            "optimiser": moments,
+            "trajectories": [
+                [*(torch.from_numpy(x) for x in one[:3]), one.terminated]
+                for one in self.trajectories
+            ],
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` gave, but for the settings; before `learn`. The optimiser of
+        the imitation begins anew where the agent is another than it was.
+
+        Raises:
+            ValueError: if there is no trajectory, or one that is none, or a number is not finite.
+        """
+        if not isinstance(state["optimiser"], dict | None):
+            raise ValueError("the optimiser's part is none")
+        self.trajectories.clear()
+        self._remembered, sizes = 0, set()
+        for obs, actions, rewards, terminated in state["trajectories"]:
+            one = Trajectory(obs.numpy(), actions.numpy(), rewards.numpy(), terminated)
+            sizes.add((one.obs.shape[1], one.actions.shape[1]))
+            if not len(one.obs) - 1 == len(one.actions) == len(one.rewards):
+                raise ValueError("a trajectory's parts differ in length")
+            if not all(np.isfinite(part).all() for part in one[:3]):
+                raise ValueError("a trajectory has numbers that are not finite")
+            self.trajectories.append(one)
+            self._remembered += len(one.rewards)
+        if len(sizes) != 1:
+            raise ValueError(f"it must hold trajectories of one task, not of {len(sizes)}")
+        self.dynamics = self._new_model(*sizes.pop())
+        self.dynamics.load_state_dict(state["model"])
+        if not all(param.isfinite().all() for param in self.dynamics.parameters()):
+            raise ValueError("the model has numbers that are not finite")
+        self._moments = state["optimiser"]
+
+    def save(self, path: Path | str) -> None:
+        """Write the `state_dict`, to go on with a saved agent (`load`).
+
+        Raises:
+            ValueError: if no episode has ended yet.
+            OSError: if the file cannot be written; an old one is left as it was.
+        """
+        checkpoint.save(self.state_dict(), Path(path))
+
+    @classmethod
+    def load(
+        cls, path: Path | str, cfg: RecallConfig | None = None, seed: int = 0
+    ) -> "RecallTraces":
+        """What `save` wrote, to be given to `learn` of the loaded agent.
+
+        Args:
+            path: of the file.
+            cfg: settings; those that were saved if None.
+            seed: as of a new one.
+
+        Raises:
+            OSError: if the file cannot be opened.
+            ValueError: if it is damaged, or made with another `RecallConfig.model`.
+        """
+        try:
+            state = torch.load(path, weights_only=True)
+            callback = cls(cfg or RecallConfig(**state["cfg"]), seed)
+            if (kind := state["cfg"]["model"]) != callback.cfg.model:
+                raise ValueError(f"its model is {kind}, not {callback.cfg.model}")
+            callback.load_state_dict(state)
+        except OSError:
+            raise
+        except Exception as error:  # torch raises many kinds for a damaged file
+            why = f"it is damaged or of other settings ({checkpoint.reason(error)})"
+            raise ValueError(f"cannot load {path}: {why}") from error
+        return callback
+
+
+def _fit(moments: dict[str, Any], optimiser: torch.optim.Optimizer) -> bool:
+    """Whether an optimiser's saved state is of parameters as those that it has now."""
+    (group,) = optimiser.param_groups
+    shapes = [param.shape for param in group["params"]]
+    known = moments.get("state", {})
+    return len(moments.get("param_groups", [{}])[0].get("params", [])) == len(shapes) and all(
+        known[i]["exp_avg"].shape == shapes[i] for i in known
+    )

@@ -1,0 +1,143 @@
+"""The table of learners: which one an environment has, and how its settings come about."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from goalgan_bt import envs
+from goalgan_bt.learners import four_rooms, locomotion, maze_config
+from goalgan_bt.learners.run_config import RunConfig
+from goalgan_bt.runs.command_line import check_ranges, parse, value_of
+from goalgan_bt.runs.errors import RunError, UsageError
+from goalgan_bt.runs.run_folder import env_of, read_settings
+
+DEFAULT = "ant_umaze"
+
+
+class Learner(NamedTuple):
+    """A learner.
+
+    module: has `prepared(cfg)`, a context that gives a `World` or says what is missing, and
+    `train(cfg, folder, stop)`; imported when it is needed, since torch takes seconds.
+    config: the class of its settings; names: its environments; knows: whether one is among them;
+    preset: the settings of an environment and a method; check: refuses what does not go together;
+    may_change: settings that a resumed run may change; has_map: whether there is a page to look at;
+    measure: what it is judged by.
+    """
+
+    module: str
+    config: type[RunConfig]
+    names: tuple[str, ...]
+    knows: Callable[[str], bool]
+    preset: Callable[[str, str | None], RunConfig]
+    check: Callable[[Any], None]
+    may_change: frozenset[str]
+    has_map: bool
+    measure: str
+
+
+LOOKING = frozenset(("resume", "viz", "viz_host", "viz_port"))
+LEARNERS = (
+    Learner(
+        "goalgan_bt.learners.maze",
+        maze_config.MazeConfig,
+        envs.NAMES,
+        envs.NAMES.__contains__,
+        maze_config.preset,
+        maze_config.check,
+        LOOKING | maze_config.MAY_CHANGE,
+        True,
+        "coverage",
+    ),
+    Learner(
+        "goalgan_bt.learners.four_rooms",
+        four_rooms.FourRoomsConfig,
+        ("four_rooms_N",),
+        four_rooms.knows,
+        four_rooms.preset,
+        four_rooms.check,
+        LOOKING | {"total_steps"},
+        False,
+        "coverage",
+    ),
+    Learner(
+        "goalgan_bt.learners.locomotion",
+        locomotion.LocomotionConfig,
+        tuple(locomotion.TASKS),
+        locomotion.TASKS.__contains__,
+        locomotion.preset,
+        locomotion.check,
+        LOOKING,
+        False,
+        "return",
+    ),
+)
+
+
+def learner_of(env: str) -> Learner:
+    """The learner of an environment.
+
+    Raises:
+        UsageError: if there is no such environment.
+    """
+    for learner in LEARNERS:
+        if learner.knows(env):
+            return learner
+    names = ", ".join(name for learner in LEARNERS for name in learner.names)
+    raise UsageError(f"unknown environment {env!r}: choose one of {names}")
+
+
+def check(cfg: RunConfig) -> None:
+    """Refuse settings that make no sense.
+
+    Raises:
+        UsageError: naming the first such setting.
+    """
+    learner = learner_of(cfg.env)
+    check_ranges(cfg)
+    learner.check(cfg)
+
+
+def from_command_line(argv: list[str]) -> Any:
+    """The settings that a command line asks for: the preset of `--env` and `--method`, then every
+    other flag; with `--resume RUN` the run's own settings take the preset's place.
+
+    Raises:
+        UsageError: for an unknown flag or a bad value.
+        RunError: for a folder that is no run.
+        SystemExit: after `--help`.
+    """
+    run = value_of(argv, "--resume")
+    default: RunConfig
+    if run is not None:
+        default = replace(load(Path(run)), resume=Path(run))
+        learner = learner_of(default.env)
+    else:
+        env = value_of(argv, "--env") or DEFAULT
+        learner = learner_of(env)
+        default = learner.preset(env, value_of(argv, "--method"))
+    cfg = parse(learner.config, argv, "python -m goalgan_bt.train", default)
+    if run is not None:
+        for name in vars(default).keys() - learner.may_change:
+            if getattr(cfg, name) != getattr(default, name):
+                flag = "--" + name.replace("_", "-")
+                raise UsageError(f"{flag} of a run cannot change when it is resumed: drop it")
+    check(cfg)
+    return cfg
+
+
+def load(folder: Path) -> Any:
+    """The settings of a run folder.
+
+    Raises:
+        RunError: if the folder is no run, or its settings cannot be read or make no sense.
+    """
+    env = env_of(folder)
+    try:
+        kind = learner_of(env).config if env else RunConfig
+        cfg = read_settings(kind, folder)
+        check(cfg)
+    except UsageError as error:
+        raise RunError(f"cannot read {folder / 'config.json'}: {error}") from None
+    return cfg

@@ -1,0 +1,130 @@
+"""Command lines from dataclasses, whose mistakes end in one line, and how every command ends."""
+
+import contextlib
+import errno
+import io
+import re
+import signal
+import sys
+from collections.abc import Callable
+from itertools import pairwise
+from types import FrameType
+from typing import Any, TypeVar
+
+import tyro
+
+from goalgan_bt.envs.goal_env import PhysicsError
+from goalgan_bt.envs.maze import MapError
+from goalgan_bt.runs.errors import InterruptedRun, RunError, UsageError
+from goalgan_bt.runs.ranges import faults
+from goalgan_bt.runs.signals import SIGNALS
+from goalgan_bt.runs.terminal import complain
+
+T = TypeVar("T")
+
+
+def parse(kind: type[T], argv: list[str] | None, prog: str, default: T | None = None) -> T:
+    """What a command line asks for.
+
+    Args:
+        kind: the dataclass of its flags.
+        argv: its words; those of this process if None.
+        prog: how the command is called, for its help.
+        default: values of the flags that are not given; else those of the class.
+
+    Raises:
+        UsageError: for an unknown flag or a bad value.
+        SystemExit: after `--help`.
+    """
+    printed = io.StringIO()
+    defaults: dict[str, Any] = {} if default is None else {"default": default}
+    try:
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+            return tyro.cli(kind, args=argv, prog=prog, **defaults)
+    except SystemExit as stop:
+        if not stop.code:  # --help
+            sys.stdout.write(printed.getvalue())
+            raise
+        raise UsageError(_one_line(printed.getvalue())) from None
+
+
+def check_ranges(settings: Any) -> None:
+    """Refuse settings that are out of their ranges.
+
+    Raises:
+        UsageError: naming the first such setting as a flag.
+    """
+    for name, problem in faults(settings):
+        raise UsageError(f"--{name.replace('_', '-')} {problem}")
+
+
+def run_command(work: Callable[[], int | None], go_on: Callable[[], str] | None = None) -> int:
+    """Do a command's work; whatever its user can mend is told in one line.
+
+    Args:
+        work: what to do; it may give an exit code.
+        go_on: tells how to go on where the work was cut short; without it Ctrl-C, which then loses
+            nothing, ends it without a word.
+
+    Returns:
+        The exit code: 0, 2 for what went wrong, 130 for Ctrl-C.
+    """
+    asked = signal.SIGINT
+
+    def stop(number: int, _: FrameType | None) -> None:
+        nonlocal asked
+        asked = signal.Signals(number)
+        raise KeyboardInterrupt
+
+    def told(problem: str) -> int:
+        complain(f"{problem}: {go_on()}" if go_on is not None and go_on() else problem)
+        return 2
+
+    for number in SIGNALS:
+        signal.signal(number, stop)
+    try:
+        return work() or 0
+    except KeyboardInterrupt:
+        if go_on is not None:
+            told("interrupted")
+        return 130 if asked == signal.SIGINT else 2
+    except MemoryError:
+        complain("out of memory: use smaller settings, for example fewer simulations")
+    except BrokenPipeError:
+        sys.stdout = sys.stderr  # nobody reads standard output any more
+        return told("standard output was closed")
+    except InterruptedRun as error:
+        return told(str(error))
+    except (UsageError, RunError, MapError, PhysicsError) as error:
+        complain(str(error))
+    except OSError as error:
+        full = error.errno == errno.ENOSPC
+        return told("the disk is full: free some space" if full else str(error))
+    return 2
+
+
+def value_of(argv: list[str], flag: str) -> str | None:
+    """The value given to a flag, as `--flag value` or `--flag=value`; the last one counts."""
+    value = None
+    for word, following in pairwise([*argv, ""]):
+        if word == flag and following and not following.startswith("--"):
+            value = following
+        elif word.startswith(flag + "="):
+            value = word.split("=", 1)[1]
+    return value
+
+
+def _one_line(text: str) -> str:
+    """What tyro prints in a box, without the box and without what repeats."""
+    words = "".join(" " if c in "╭╮╰╯│─━┃\n" else c for c in text).split()
+    line = " ".join(word for word in words if set(word) != {"-"})
+    wrong = re.search(r"Error parsing (--\S+): .*?(?:\['(.+?)'\]|: '(.+?)')", line)
+    if wrong:
+        value = (wrong[2] or wrong[3]).replace("', '", " ")
+        return f"{wrong[1]} cannot be {value!r}; --help tells what it takes"
+    line = (
+        line.removeprefix("Invalid choice ")
+        .removeprefix("Parsing error ")
+        .removeprefix("Unrecognized options ")
+    )
+    return line.split(" For full helptext")[0][:300] + "; --help lists every setting"

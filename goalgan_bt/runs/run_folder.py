@@ -1,0 +1,232 @@
+"""The run folder: everything a viewer, a plot or a colleague needs, and nothing to unpickle.
+
+runs/<env>-<time>-s<seed>/
+    config.json       the resolved settings
+    meta.json         versions, git commit, command line, the maze as text; what it was resumed with
+    metrics.csv       a row per iteration; columns may be added while it grows
+    frames/000010.npz a report: goals, labels, replay, traces, coverage (see `RunWriter.frame`)
+    checkpoint.pt     the whole training state (see `goalgan_bt.runs.checkpoint`)
+    policy.pt         of locomotion, in the checkpoint's place when it is finished
+    ended.txt         how the run ended; absent while it goes on, or where it was killed
+    lock              held by the process that trains
+    events.*          TensorBoard, if it is installed (extra `tensorboard`)
+"""
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+import types
+import typing
+from dataclasses import fields, is_dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any, TypeVar
+
+from goalgan_bt.envs.maze import Maze
+from goalgan_bt.runs.errors import RunError
+
+T = TypeVar("T")
+
+ENDED = "ended.txt"
+PACKAGES = ("goalgan_bt", "mujoco", "numpy", "torch", "gymnasium", "gymnasium-robotics", "tyro")
+
+
+def create_folder(out: Path, env: str, seed: int) -> Path:
+    """A new, empty run folder `<env>-<time>-s<seed>` in `out`."""
+    reason: str | None = "all names are taken"
+    name = f"{env}-{time.strftime('%Y%m%d-%H%M%S')}-s{seed}"
+    for attempt in range(1, 1000):
+        folder = out / (name if attempt == 1 else f"{name}-{attempt}")
+        try:
+            (folder / "frames").mkdir(parents=True)
+            return folder
+        except FileExistsError:
+            continue
+        except OSError as error:
+            reason = error.strerror
+            break
+    raise RunError(f"cannot make a run folder in {out} ({reason}): choose another with --out")
+
+
+def new_run(
+    out: Path, env: str, seed: int, settings: dict[str, Any], maze: Maze | None = None
+) -> Path:
+    """A new run folder in `out` with its `meta.json` and `config.json`."""
+    folder = create_folder(out, env, seed)
+    write_meta(folder, maze)
+    write_settings(folder, settings)
+    return folder
+
+
+def code_commit(folder: Path) -> str | None:
+    """The git commit of the checkout that a folder of code is part of.
+
+    With "-dirty" behind it if the code was changed since: that folder, or what belongs to it
+    outside (tables and texts, which studies write, do not count). None if it is part of no
+    checkout, such as an installed package, or there is no git.
+    """
+
+    def git(*words: str) -> str:
+        asked = ["git", *words]
+        return subprocess.run(
+            asked, cwd=folder, capture_output=True, text=True, check=True
+        ).stdout.strip()
+
+    try:
+        if not git("ls-files", "."):
+            return None
+        changed = git("status", "--porcelain", "--", ".", ":/envs", ":/viz", ":/pyproject.toml")
+        return git("rev-parse", "--verify", "HEAD") + "-dirty" * bool(changed)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def write_meta(folder: Path, maze: Maze | None) -> None:
+    """Write what is needed to know and to draw this run to `meta.json`."""
+    versions = {}
+    for package in PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            versions[package] = "not installed"
+    meta = {
+        **_call(),
+        "python": platform.python_version(),
+        "cores": len(os.sched_getaffinity(0)),
+        "versions": versions,
+        "maze": None if maze is None else {"rows": maze.rows, "cell_size": maze.cell_size},
+    }
+    (folder / "meta.json").write_text(json.dumps(meta, indent=2) + "\n")
+
+
+def _call() -> dict[str, Any]:
+    return {"argv": sys.argv[1:], "commit": code_commit(Path(__file__).parents[1])}
+
+
+def note_resumed(folder: Path) -> None:
+    """Add to `meta.json` what a run is taken up with: the code may be another by now."""
+    meta = read_meta(folder)
+    meta["resumed"] = [*meta.get("resumed", []), _call()]
+    text = json.dumps(meta, indent=2) + "\n"
+    write_atomically(folder / "meta.json", lambda file: file.write(text.encode()))
+
+
+def commits(folder: Path) -> str:
+    """The commits of the code that a run was made with, in order, with "+" between them."""
+    meta = read_meta(folder)
+    calls = [meta, *meta.get("resumed", [])]
+    return "+".join(dict.fromkeys(call["commit"] or "unknown" for call in calls))
+
+
+def write_settings(folder: Path, settings: dict[str, Any]) -> None:
+    """Write the resolved settings to `config.json`."""
+    text = json.dumps(settings, indent=2, default=str) + "\n"
+    write_atomically(folder / "config.json", lambda file: file.write(text.encode()))
+
+
+def read_settings(kind: type[T], folder: Path) -> T:
+    """The settings in `config.json`, as the dataclass that they were.
+
+    Raises:
+        RunError: if the folder is no run, or they cannot be read.
+    """
+    path = folder / "config.json"
+    try:
+        return _build(kind, json.loads(path.read_text()))
+    except FileNotFoundError:
+        raise RunError(f"{folder} is no run: it has no config.json") from None
+    except (OSError, ValueError, TypeError) as error:
+        raise RunError(f"cannot read {path}: {error}") from None
+
+
+def _build(kind: type[T], values: Any) -> T:
+    """A dataclass from what `asdict` and JSON made of it."""
+    if not isinstance(values, dict):
+        raise TypeError(f"expected settings, found {values!r}")
+    hints = typing.get_type_hints(kind)
+    known = {f.name for f in fields(typing.cast(Any, kind))}
+    if unknown := set(values) - known:
+        raise ValueError(f"unknown settings {', '.join(sorted(unknown))}")
+    return kind(**{name: _convert(hints[name], value) for name, value in values.items()})
+
+
+def _convert(hint: Any, value: Any) -> Any:
+    if is_dataclass(hint):
+        return _build(typing.cast(type[Any], hint), value)
+    if hint in (bool, int, float, str) and (
+        not isinstance(value, (hint, int) if hint is float else hint)
+        or isinstance(value, bool) != (hint is bool)
+    ):
+        raise TypeError(f"expected {hint.__name__}, found {value!r}")
+    if value is not None and (
+        hint is Path or (isinstance(hint, types.UnionType) and Path in typing.get_args(hint))
+    ):
+        return Path(value)
+    return tuple(value) if isinstance(value, list) else value
+
+
+def env_of(folder: Path) -> str:
+    """The environment of a run; none, "", where that cannot be read: who reads all of its settings
+    tells why."""
+    try:
+        return str(json.loads((folder / "config.json").read_text())["env"])
+    except (OSError, ValueError, TypeError, KeyError):
+        return ""
+
+
+def write_atomically(path: Path, write: Any) -> None:
+    """Call `write(binary file)` on a temporary file that then takes `path`'s place."""
+    temporary = path.with_name(path.name + ".part")
+    try:
+        with temporary.open("wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def read_meta(folder: Path) -> dict[str, Any]:
+    """A run's `meta.json`.
+
+    Raises:
+        RunError: if the folder has none or it cannot be read.
+    """
+    try:
+        meta: dict[str, Any] = json.loads((folder / "meta.json").read_text())
+    except FileNotFoundError:
+        raise RunError(f"{folder} is no run: it has no meta.json") from None
+    except (OSError, ValueError) as error:
+        raise RunError(f"cannot read {folder / 'meta.json'}: {error}") from None
+    if not isinstance(meta, dict) or "commit" not in meta:
+        raise RunError(f"{folder / 'meta.json'} is damaged: it names no commit")
+    resumed = meta.get("resumed", [])
+    if not isinstance(resumed, list) or not all(
+        isinstance(call, dict) and "commit" in call for call in resumed
+    ):
+        raise RunError(f"{folder / 'meta.json'} is damaged: what it was resumed with")
+    return meta
+
+
+def maze_of(folder: Path) -> Maze | None:
+    """The maze of a run, or None for an environment without walls.
+
+    Raises:
+        RunError: if the folder is no run.
+    """
+    meta = read_meta(folder)
+    try:
+        maze = meta["maze"]
+        if maze is None:
+            return None
+        side = float(maze["cell_size"])
+        if not 0 < side < 1e3:
+            raise ValueError(f"cells of {side} m")
+        return Maze(tuple(maze["rows"]), side)
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunError(f"{folder / 'meta.json'} is damaged: {error!r}") from None

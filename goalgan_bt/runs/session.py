@@ -1,0 +1,246 @@
+"""A run as it goes on: its limits and clock, what is due, what is written and what is shown.
+
+Whatever learns, its loop is
+
+    with Session(folder, settings, limits) as run:
+        while run.goes_on():
+            ...
+            if run.measures():
+                ...
+            run.report(metrics, ...)
+"""
+
+import math
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from goalgan_bt.runs.background import Background, group
+from goalgan_bt.runs.clock import Clock
+from goalgan_bt.runs.errors import RunError
+from goalgan_bt.runs.run_folder import write_settings
+from goalgan_bt.runs.run_writer import RunWriter
+from goalgan_bt.runs.signals import Stop
+from goalgan_bt.runs.terminal import Terminal
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Where a run ends, whichever comes first; None is no limit."""
+
+    total_steps: int | None = None
+    iterations: int | None = None
+    minutes: float | None = None
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """When a run measures and reports.
+
+    Attributes:
+        next_measurement: training steps of the measurement after the one at those steps.
+        first: iteration before which there is none.
+        report_every: iterations between two reports; one with each measurement besides.
+    """
+
+    next_measurement: Callable[[int], float]
+    first: int = 1
+    report_every: int = 1
+
+
+class Session:
+    """One run.
+
+    Args:
+        folder: its folder; None for a rank that does not record.
+        settings: all of them, to be written into it.
+        limits, schedule: when it ends, when it measures.
+        title: of the live table; None shows nothing on the terminal.
+        state: what `state_dict` gave, to go on from there.
+        stop: asked at the end of every iteration whether to end early.
+        agreed: makes a number the same on all ranks.
+        events: whether TensorBoard gets the metrics too.
+
+    Attributes:
+        iteration: the one under way, from 1 on.
+        steps: environment steps so far by purpose: `train`, `label`, `eval`.
+        progress: how far this iteration leads towards the first of the limits, 0 to 1 (more in the
+            last one, which may pass it); 0 without limits.
+        clock: where the time goes; background: what learns beside the main thread.
+        row: metrics of this iteration.
+
+    Raises:
+        RunError: if the run has reached its limits, or another process trains it.
+    """
+
+    def __init__(
+        self,
+        folder: Path | None,
+        settings: Mapping[str, Any],
+        limits: Limits,
+        schedule: Schedule,
+        title: str | None = None,
+        *,
+        state: Mapping[str, Any] | None = None,
+        stop: Stop | None = None,
+        agreed: Callable[[float], float] = float,
+        events: bool = True,
+    ) -> None:
+        self.folder, self._limits, self._schedule = folder, limits, schedule
+        self._stop, self._agreed = stop, agreed
+        self.iteration, self._next = 0, 0.0
+        self.steps = {"train": 0, "label": 0, "eval": 0}
+        seconds = 0.0
+        if state is not None:
+            self.iteration, self._next = int(state["iteration"]), float(state["next_measurement"])
+            self.steps = {name: int(state["steps"][name]) for name in self.steps}
+            seconds = float(state["seconds"])
+        self.clock = Clock(seconds)
+        if state is not None and self._done() >= 1:
+            raise RunError(
+                f"{folder} has reached its limits ({self.iteration} iterations, "
+                f"{self.steps['train']} steps): ask for more, for example with --total-steps"
+            )
+        self.progress = 0.0
+        self.row: dict[str, float] = {}
+        self._reached, self._last, self._measures = 0.0, False, False
+        self._writer = None
+        if folder is not None:
+            self._writer = RunWriter(folder, self.iteration, events)
+            write_settings(folder, dict(settings))
+        self._terminal = None if title is None else Terminal(title)
+        self.background = Background()
+
+    @property
+    def records(self) -> bool:
+        """Whether this process writes the run folder."""
+        return self._writer is not None
+
+    def goes_on(self) -> bool:
+        """Begin the next iteration, unless the last one was the last."""
+        if self._last:
+            return False
+        self.iteration += 1
+        self.row = {}
+        self.progress = self._agreed(self._done())
+        return True
+
+    def count(self, purpose: str, steps: int) -> None:
+        """Count environment steps."""
+        self.steps[purpose] += steps
+
+    def note(self, name: str, metrics: Mapping[str, float]) -> None:
+        """Metrics of this iteration, under a common name."""
+        self.row |= group(name, metrics)
+
+    def measures(self) -> bool:
+        """Whether this iteration measures what the policy is worth: where that is due, and at the
+        end. To be asked once, when everything else of the iteration is done."""
+        self._reached = self._agreed(self._done())
+        stopped = self._agreed(float(self._stop is not None and self._stop.requested)) > 0
+        self._last = self._reached >= 1 or stopped
+        steps = self.steps["train"]
+        due = self.iteration >= self._schedule.first and steps >= self._next
+        self._measures = due or self._last
+        if self._measures:
+            self._next = self._schedule.next_measurement(steps)
+        return self._measures
+
+    @property
+    def complete(self) -> bool:
+        """Whether the run has reached the first of its limits."""
+        return self._reached >= 1
+
+    @property
+    def reports(self) -> bool:
+        """Whether this iteration's report is shown."""
+        return self._measures or self.iteration % self._schedule.report_every == 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a run needs to go on, besides what it has learned."""
+        return {
+            "iteration": self.iteration,
+            "steps": dict(self.steps),
+            "seconds": self.clock.total(),
+            "next_measurement": self._next,
+        }
+
+    def report(
+        self,
+        metrics: Mapping[str, float],
+        state: Callable[[], Mapping[str, Any]] | None = None,
+        frame: Callable[[], Mapping[str, Any]] | None = None,
+    ) -> None:
+        """Write and show what an iteration gave.
+
+        Args:
+            metrics: of the iteration, besides those that were noted.
+            state: gives all that was learned, which is saved with each measurement.
+            frame: gives the arrays of a picture (see `RunWriter.frame`).
+        """
+        if self._writer is None or self.folder is None:
+            return
+        self.row = (
+            {"iteration": self.iteration}
+            | self.row
+            | self.background.metrics
+            | group("steps", self.steps)
+            | group("time", self.clock.metrics(self.steps["train"]))
+            | {"memory/resident": resident_mib()}
+            | dict(metrics)
+        )
+        if self._measures and state is not None:
+            from goalgan_bt.runs import checkpoint  # torch, which not every learner needs
+
+            whole = {"run": self.state_dict(), **state()}
+            checkpoint.save(whole, self.folder / "checkpoint.pt")
+        self._writer.metrics(self.row)
+        if self.reports:
+            if self._terminal is not None:
+                self._terminal.report(self.row, self.left())
+            if frame is not None:
+                self._writer.frame(self.iteration, **frame())
+
+    def left(self) -> float:
+        """Seconds that the run will still take; infinite where nothing tells."""
+        if not self._reached:
+            return math.inf
+        return self.clock.total() * max(1 / self._reached - 1, 0)
+
+    def _done(self) -> float:
+        """How far the run is towards the first of its limits: 1 or more at its end."""
+        limits = self._limits
+        return max(
+            self.iteration / limits.iterations if limits.iterations else 0.0,
+            self.steps["train"] / limits.total_steps if limits.total_steps else 0.0,
+            self.clock.total() / (60 * limits.minutes) if limits.minutes else 0.0,
+        )
+
+    def __enter__(self) -> "Session":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.background.close()
+        if self._terminal is not None:
+            self._terminal.close()
+        if self.folder is not None and isinstance(error, OSError) and not self.folder.exists():
+            raise RunError(f"the run folder {self.folder} has vanished: start again") from None
+        if self._writer is not None and error is None:
+            self._writer.close("complete" if self.complete else "stopped early: --resume goes on")
+
+
+def resident_mib() -> float:
+    """Memory that this process has in use, MiB; NaN where the system does not tell."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return math.nan
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20

@@ -1,0 +1,92 @@
+"""The page that training opens: `python -m goalgan_bt.viz` as a child process."""
+
+import contextlib
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+from goalgan_bt.runs.errors import UsageError
+from goalgan_bt.runs.signals import Stop
+from goalgan_bt.runs.terminal import complain, say
+
+
+class PageProcess:
+    """A page over a run in a process of its own.
+
+    In a terminal it outlives the training until Ctrl-C; otherwise it ends with this process,
+    however that ends, so that no script waits for it.
+
+    Args:
+        folder: the run folder.
+        host, port: where it shall listen.
+    """
+
+    def __init__(self, folder: Path, host: str, port: int) -> None:
+        self._terminal = sys.stdout.isatty()
+        command = [sys.executable, "-m", "goalgan_bt.viz", str(folder)]
+        command += ["--host", host, "--port", str(port)]
+        self._process = subprocess.Popen(
+            command if self._terminal else [*command, "--with-parent"],
+            stdin=None if self._terminal else subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self._address: str | None = None
+        self._known = threading.Event()  # the address, or that there will be none
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def close(self, ended_well: bool) -> None:
+        """End the page; in a terminal, after a run that ended well, only when people are done."""
+        with contextlib.suppress(KeyboardInterrupt):
+            if self._terminal and ended_well and self._known.wait(30) and self._address:
+                say(f"the page stays until Ctrl-C: {self._address}")
+                self._process.wait()
+        self._process.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout=5)
+
+    def _listen(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            # Nobody may read our output any more; the page's must be read on, lest it block.
+            with contextlib.suppress(OSError, ValueError):
+                if line.startswith("view: "):
+                    if self._address is None:
+                        self._address = line.split()[1]
+                        self._known.set()
+                    say(line.strip())
+                elif line.startswith("error: "):
+                    complain(line.removeprefix("error: ").strip())
+        self._known.set()
+
+
+@contextlib.contextmanager
+def watching(folder: Path, host: str, port: int, stop: Stop) -> Iterator[None]:
+    """A page over a run while it is trained; it stays a while after a run that ended well (see
+    `PageProcess`), unless somebody wanted it to stop."""
+    page, ended_well = PageProcess(folder, host, port), False
+    try:
+        yield
+        ended_well = not stop.requested
+    finally:
+        page.close(ended_well)
+
+
+def free_port(host: str, port: int) -> int:
+    """That port, or a later one if it is busy.
+
+    Raises:
+        UsageError: if one cannot listen at that address at all.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    for candidate in [*range(port, min(port + 100, 65536)), 0]:
+        try:
+            socket.create_server((host, candidate), family=family).close()
+            return candidate
+        except OSError as error:
+            reason = error
+    raise UsageError(f"cannot listen on {host}: {reason}")
