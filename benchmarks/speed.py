@@ -115,7 +115,7 @@ def collection(cfg: MazeConfig, durations: Iterable[float]) -> Iterator[Sample]:
     env = make_env(cfg, cfg.rollout.num_envs)
     learner = MazeLearner(env, cfg)
     collector = Collector(env, cfg.rollout, learner.rng, learner.noise["rollout"])
-    goals = learner.gan.sample(300)
+    goals = learner.curriculum.gan.sample(300)
     collector.begin(goals)
 
     def batch() -> int:

@@ -29,6 +29,7 @@ from goalgan_bt.runs.command_line import run_command
 from goalgan_bt.runs.run_folder import new_run
 from goalgan_bt.runs.signals import Stop
 from goalgan_bt.runs.terminal import complain, say
+from goalgan_bt.viz import page_process
 
 Begun = Callable[[Path], None]
 NOTHING = "nothing new was saved, give the same command again"
@@ -63,43 +64,43 @@ def train(env: str = "ant_umaze", *, viz: str = "none", **settings: Any) -> Trai
             values = value if isinstance(value, tuple | list) else (value,)
             words += [f"--{flag}", *map(str, values)]
     cfg = from_command_line(words)
-    module = importlib.import_module(learner_of(cfg.env).module)
-    with Stop() as stop:
-        trained = run(cfg, module, stop, lambda folder: None)
+    trained, stop = run(cfg, importlib.import_module(learner_of(cfg.env).module), lambda _: None)
     if stop.requested:
         raise KeyboardInterrupt
     return trained
 
 
-def run(cfg: RunConfig, module: Any, stop: Stop, begun: Begun) -> Trained:
+def run(cfg: RunConfig, module: Any, begun: Begun) -> tuple[Trained, Stop]:
     """Make the run folder, or take up the one to go on with, open the page and train.
 
     Args:
         cfg: settings.
         module: of their learner.
-        stop: asked now and then whether to end early.
         begun: told the folder as soon as there is one.
-    """
-    with module.prepared(cfg) as world, contextlib.ExitStack() as stack:
-        folder = cfg.resume
-        if os.environ.get("RANK", "0") == "0":  # of several processes the first records
-            watch = None
-            if cfg.viz == "browser" and learner_of(cfg.env).has_map:
-                from goalgan_bt.viz.page_process import free_port, watching
 
-                watch = watching
-                free_port(cfg.viz_host, cfg.viz_port)  # or there will be no run
+    Returns:
+        What came of it, and whether somebody wanted it to stop.
+    """
+    with contextlib.ExitStack() as at_last, module.prepared(cfg) as world:
+        folder, page, stop = cfg.resume, None, Stop()
+        if os.environ.get("RANK", "0") == "0":  # of several processes the first records
+            if cfg.viz == "browser" and learner_of(cfg.env).has_map:
+                page = page_process.PageProcess(cfg.viz_host, cfg.viz_port)
+                at_last.callback(page.close)
             if folder is None:
                 folder = new_run(cfg.out, world.name, cfg.seed, asdict(cfg), world.maze)
             begun(folder)
             say(f"run folder: {folder}")
-            if watch is not None:
-                stack.enter_context(watch(folder, cfg.viz_host, cfg.viz_port, stop))
-        trained: Trained = module.train(cfg, folder, stop)
+            if page is not None:
+                page.open(folder)
+        with stop:
+            trained: Trained = module.train(cfg, folder, stop)
         if folder is not None and not stop.requested:
             value, steps = trained.value, trained.steps
             say(f"{trained.measure} {value:.3f} after {steps:,} training steps: {folder}")
-        return trained
+            if page is not None:
+                page.ended_well = True
+        return trained, stop
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -114,9 +115,8 @@ def main(argv: list[str] | None = None) -> int:
         cfg = from_command_line(sys.argv[1:] if argv is None else argv)
         with nothing_to_lose(f"interrupted: {NOTHING}"):  # torch takes seconds to import
             module = importlib.import_module(learner_of(cfg.env).module)
-        with Stop() as stop:
-            run(cfg, module, stop, begun)
-        if stop.signal is None:
+        _, stop = run(cfg, module, begun)
+        if not stop.requested:
             return 0
         if os.environ.get("RANK", "0") == "0":
             complain(f"stopped by {stop.name}: {how_to_go_on(folder)}")

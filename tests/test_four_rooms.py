@@ -271,7 +271,7 @@ def test_larger_rooms_need_recall_traces(tmp_path):
         (["--env", "four_rooms_5"], "four_rooms_7"),
         (["--traces.length", "0"], "--traces.length must be between 1"),
         (["--discount", "1.5"], "--discount must be between 0 and 1"),
-        (["--method", "alphago"], "invalid choice 'alphago' for argument '--method'"),
+        (["--method", "alphago"], "unknown method 'alphago': choose one of actor_critic"),
         (["--traces.depth", "3"], "--traces.depth"),
         (["--replay.beta", "1000"], "--replay.beta must be between 0 and 1"),
         (["--horizon", "1000000"], "--horizon must be between 1"),

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from test_mlp import by_torch
+from test_networks import by_torch
 
 from goalgan_bt.curriculum.gan import GoalGAN
 from goalgan_bt.curriculum.settings import GanConfig

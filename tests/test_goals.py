@@ -90,11 +90,12 @@ def test_an_estimator_without_episodes_knows_nothing():
 
 def test_only_goals_near_visited_places_are_intermediate():
     cfg = maze_config.preset("ant_umaze")
-    learner = MazeLearner(make_env(cfg, 1), cfg)
-    learner.visited.add(np.array([[0.0, 0.0]]))
+    curriculum = MazeLearner(make_env(cfg, 1), cfg).curriculum
+    curriculum.see(np.array([[0.0, 0.0]]))
     near, far = cfg.goals.near * 0.9, cfg.goals.near * 1.1
     goals = np.array([[near, 0.0], [far, 0.0], [near, 0.0]])
-    labels = learner.intermediate(goals, np.array([0.5, 0.5, 1.0]))
+    labels, _ = curriculum.judge(goals, np.array([0.5, 0.5, 1.0]))
     assert labels.tolist() == [True, False, False]
-    learner.estimator.add(goals.repeat(5, axis=0), np.ones(15, dtype=bool))
-    assert learner.estimated_success(np.array([[0.9, 0.0], [1.1, 0.0]])).tolist() == [1.0, 0.0]
+    curriculum.estimator.add(goals.repeat(5, axis=0), np.ones(15, dtype=bool))
+    mapped = curriculum.mapped(np.array([[0.9, 0.0], [1.1, 0.0]]), reach=1.0)
+    assert mapped.tolist() == [1.0, 0.0]

@@ -80,7 +80,7 @@ def test_a_run_that_is_stopped_goes_on(method, tmp_path):
         _, said = running.communicate(timeout=20)
     (folder,) = tmp_path.iterdir()
     assert running.returncode == 2 and said.count("\n") == 1
-    assert said.endswith(f"go on from the last measurement with --resume {folder}\n")
+    assert said.endswith(f"go on from the last checkpoint with --resume {folder}\n")
     saved = torch.load(folder / "checkpoint.pt", weights_only=True)
     assert 0 < saved["steps"] < steps and saved["parameters"]["policy"]
     if method == "sac":

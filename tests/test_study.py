@@ -177,7 +177,7 @@ def test_a_study_of_returns(tmp_path):
     assert len(made) == 2 == len(sorted((tmp_path / "runs").glob("*/*/*/*/ended.txt")))
     # In the picture there are the curves.
     spec = plan.load(str(tmp_path / "run.toml"))
-    drawn = statistics.draw(spec, report.curves(Tables(tmp_path / "run", "return")))
+    drawn = report.draw(spec, report.curves(Tables(tmp_path / "run", "return")))
     low, high = drawn.axes[0].get_ylim()
     returns = [float(row["return"]) for row in rows]
     assert low < min(returns) and high > np.mean(returns)

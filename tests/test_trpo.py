@@ -6,7 +6,7 @@ import pytest
 import torch
 from sb3_contrib import TRPO
 from stable_baselines3.common.logger import configure
-from test_mlp import by_torch
+from test_networks import by_torch
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from goalgan_bt.agent import trpo

@@ -206,7 +206,8 @@ def test_the_ants_mathematics_is_the_same_on_tensors(seed, n):
     ):
         mine, theirs = function(*arrays), function(*map(torch.from_numpy, arrays))
         assert torch.is_tensor(theirs)
-        assert np.allclose(mine, theirs, atol=1e-5)
+        # The front, a direction in single precision, may be that of a nearly upright axis.
+        assert np.allclose(mine, theirs, atol=1e-4)
 
 
 @settings(max_examples=50, deadline=None)

@@ -5,29 +5,40 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 from goalgan_bt.runs.errors import UsageError
-from goalgan_bt.runs.signals import Stop
 from goalgan_bt.runs.terminal import complain, say
 
 
 class PageProcess:
     """A page over a run in a process of its own.
 
-    In a terminal it outlives the training until Ctrl-C; otherwise it ends with this process,
-    however that ends, so that no script waits for it.
+    In a terminal it outlives a training that ended well until Ctrl-C; otherwise it ends with this
+    process, however that ends, so that no script waits for it.
 
     Args:
-        folder: the run folder.
         host, port: where it shall listen.
+
+    Attributes:
+        ended_well: to be set when the training has.
+
+    Raises:
+        UsageError: if one cannot listen there at all.
     """
 
-    def __init__(self, folder: Path, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int) -> None:
+        free_port(host, port)
+        self._place = ["--host", host, "--port", str(port)]
         self._terminal = sys.stdout.isatty()
-        command = [sys.executable, "-m", "goalgan_bt.viz", str(folder)]
-        command += ["--host", host, "--port", str(port)]
+        self._process: subprocess.Popen[str] | None = None
+        self._address: str | None = None
+        self._known = threading.Event()  # the address, or that there will be none
+        self.ended_well = False
+
+    def open(self, folder: Path) -> None:
+        """Begin to show a run."""
+        command = [sys.executable, "-m", "goalgan_bt.viz", str(folder), *self._place]
         self._process = subprocess.Popen(
             command if self._terminal else [*command, "--with-parent"],
             stdin=None if self._terminal else subprocess.PIPE,
@@ -35,14 +46,14 @@ class PageProcess:
             stderr=subprocess.STDOUT,
             text=True,
         )
-        self._address: str | None = None
-        self._known = threading.Event()  # the address, or that there will be none
         threading.Thread(target=self._listen, daemon=True).start()
 
-    def close(self, ended_well: bool) -> None:
+    def close(self) -> None:
         """End the page; in a terminal, after a run that ended well, only when people are done."""
+        if self._process is None:
+            return
         with contextlib.suppress(KeyboardInterrupt):
-            if self._terminal and ended_well and self._known.wait(30) and self._address:
+            if self._terminal and self.ended_well and self._known.wait(30) and self._address:
                 say(f"the page stays until Ctrl-C: {self._address}")
                 self._process.wait()
         self._process.terminate()
@@ -50,7 +61,7 @@ class PageProcess:
             self._process.wait(timeout=5)
 
     def _listen(self) -> None:
-        assert self._process.stdout is not None
+        assert self._process is not None and self._process.stdout is not None
         for line in self._process.stdout:
             # Nobody may read our output any more; the page's must be read on, lest it block.
             with contextlib.suppress(OSError, ValueError):
@@ -62,18 +73,6 @@ class PageProcess:
                 elif line.startswith("error: "):
                     complain(line.removeprefix("error: ").strip())
         self._known.set()
-
-
-@contextlib.contextmanager
-def watching(folder: Path, host: str, port: int, stop: Stop) -> Iterator[None]:
-    """A page over a run while it is trained; it stays a while after a run that ended well (see
-    `PageProcess`), unless somebody wanted it to stop."""
-    page, ended_well = PageProcess(folder, host, port), False
-    try:
-        yield
-        ended_well = not stop.requested
-    finally:
-        page.close(ended_well)
 
 
 def free_port(host: str, port: int) -> int:

@@ -158,7 +158,7 @@ class GoalCurriculum:
         self._pending.clear()
         judged = self.judge(pending, self.estimator(pending))
         losses = self.gan.fit(*judged.lesson)
-        told = {f"gan_{name}": value for name, value in losses.items()}
+        told = {f"gan_{name}": float(value) for name, value in losses.items()}
         return told | {"intermediate": float(judged.labels.mean())}
 
     def success(self, goals: ArrayLike) -> FloatArray:

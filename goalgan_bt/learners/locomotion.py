@@ -20,6 +20,7 @@ from goalgan_bt.learners.run_config import RunConfig, Trained, World
 from goalgan_bt.recall.settings import RecallConfig
 from goalgan_bt.runs.errors import RunError, UsageError
 from goalgan_bt.runs.ranges import between
+from goalgan_bt.runs.run_folder import end_run
 from goalgan_bt.runs.session import Limits, Schedule, Session
 from goalgan_bt.runs.signals import Stop
 
@@ -194,6 +195,10 @@ def train(cfg: LocomotionConfig, folder: Path | None, stop: Stop | None = None) 
         state, mean = resume(agent, recall, folder)
         fresh = np.random.SeedSequence((cfg.seed, state["iteration"])).generate_state(1)
         agent.set_random_seed(int(fresh[0]))  # or it would draw what it drew at first
+        if agent.num_timesteps >= cfg.total_steps:  # cut off just before it could end
+            checkpoint_to_policy(agent, folder)
+            end_run(folder, "complete")
+            return Trained(folder, "return", mean, agent.num_timesteps)
     with Session(
         folder,
         asdict(cfg),

@@ -85,3 +85,16 @@ class TrainedPolicy:
         said = np.clip(self._act(env.observations(states, goals), noise), -1.0, 1.0)
         actions = np.asarray(env.to_body(said, states, goals), dtype=float)
         return actions if state.ndim == 2 else actions[0]
+
+
+def load_policy(folder: Path | str, seed: int = 0) -> TrainedPolicy:
+    """The policy of a run of a maze or a box, as its last checkpoint has it (see `TrainedPolicy`).
+
+    Args:
+        folder: the run folder.
+        seed: of the policy's noise, where it acts with any.
+
+    Raises:
+        RunError: if the folder is no such run, or has no checkpoint that can be read.
+    """
+    return TrainedPolicy(folder, seed)

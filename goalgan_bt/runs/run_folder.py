@@ -168,6 +168,11 @@ def _convert(hint: Any, value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
+def end_run(folder: Path, how: str) -> None:
+    """Say how a run ended."""
+    (folder / ENDED).write_text(how + "\n")
+
+
 def env_of(folder: Path) -> str:
     """The environment of a run; none, "", where that cannot be read: who reads all of its settings
     tells why."""

@@ -10,7 +10,7 @@ import numpy as np
 from goalgan_bt.runs.errors import RunError
 from goalgan_bt.runs.frames import frame_paths
 from goalgan_bt.runs.metrics_csv import read_metrics, write_table
-from goalgan_bt.runs.run_folder import ENDED, note_resumed, write_atomically
+from goalgan_bt.runs.run_folder import ENDED, end_run, note_resumed, write_atomically
 from goalgan_bt.runs.terminal import complain
 
 
@@ -88,7 +88,7 @@ class RunWriter:
 
     def close(self, how: str) -> None:
         """Say how the run ended, and flush what TensorBoard buffers."""
-        (self.folder / ENDED).write_text(how + "\n")
+        end_run(self.folder, how)
         self._lock.close()
         if self._events is not None:
             self._events.close()
