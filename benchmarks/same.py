@@ -29,33 +29,36 @@ import tyro
 ROOT = Path(__file__).parents[1]
 TINY = (
     "--rollout.num-envs 32 --rollout.steps 40 --horizon 120 --backtracking.min-transitions 200 "
-    "--coverage.rollouts 1 --coverage.every 3000 --gan.steps 20 --imitation.fade 2 --threads 1 "
-    "--viz none "
+    "--coverage.rollouts 1 --coverage.every 3000 --gan.steps 20 --threads 1 --viz none "
 )
 POINT = f"--env point_umaze {TINY} --iterations 4 --goals.near 1"
 ROOMS = "--env four_rooms_11 --total-steps 30000"
 HOPPER = "--env hopper --backtracking.min-steps 100 --episodes 1"
+ANT = f"--env ant_umaze {TINY} --iterations 2 --goals.near 3"
+LATE = "--imitation.fade 2"  # in so short a run nothing would be imitated, else
 COMMANDS = {  # name -> flags of goalgan_bt.train
     "point": POINT,
-    "ant": f"--env ant_umaze {TINY} --iterations 2 --goals.near 3",
+    "ant": ANT,
     "point_nd": f"--env point_nd --dim 3 {TINY} --iterations 3",
-    "recall_traces_paper": f"{POINT} --method recall_traces_paper",
-    "value_seeds": f"{POINT} --method value_seeds",
-    "goal_gan": f"{POINT} --method goal_gan",
-    "gan_fit_all": f"{POINT} --method gan_fit_all",
-    "alp_gmm": f"{POINT} --method alp_gmm",
-    "oracle": f"{POINT} --method oracle",
-    "feasible": f"{POINT} --method feasible",
-    "hindsight": f"{POINT} --method hindsight",
-    "forward_model": f"{POINT} --method forward_model",
-    "actor_critic": f"{ROOMS} --method actor_critic",
-    "per": f"{ROOMS} --method per",
-    "rooms_recall_traces": f"{ROOMS} --method recall_traces",
-    "random_model": f"{ROOMS} --method random_model",
+    **{
+        method: f"{POINT} --method {method}"
+        for method in (
+            "recall_traces_paper", "value_seeds", "goal_gan", "gan_fit_all", "alp_gmm", "oracle",
+            "feasible", "uniform", "hindsight", "forward_model",
+        )
+    },
+    "point_imitating": f"{POINT} {LATE}",
+    "ant_imitating": f"{ANT} {LATE}",
+    "hindsight_imitating": f"{POINT} --method hindsight {LATE}",
+    "forward_imitating": f"{POINT} --method forward_model {LATE}",
+    **{
+        f"rooms_{method}": f"{ROOMS} --method {method}"
+        for method in ("actor_critic", "per", "recall_traces", "random_model")
+    },
     "trpo": f"{HOPPER} --method trpo --total-steps 12000 --num-envs 2",
     "trpo_forward": f"{HOPPER} --method trpo --total-steps 12000 --backtracking.model forward",
     "sac": f"{HOPPER} --method sac --total-steps 3000",
-}
+}  # fmt: skip
 RANKS = {"two_ranks": f"{POINT} --rollout.num-envs 64"}
 
 

@@ -4,7 +4,7 @@ from test_networks import by_torch
 
 from goalgan_bt.agent.policy import GaussianPolicy, log_prob, mean_kl
 from goalgan_bt.agent.settings import PolicyConfig
-from goalgan_bt.recall.imitation import Imitation
+from goalgan_bt.recall.imitation import Imitation, imitate_within
 from goalgan_bt.recall.settings import ImitationConfig
 
 
@@ -65,3 +65,24 @@ def test_the_gradient_is_that_of_the_likelihood():
     loss = -log_prob(mean, policy.bounded_log_std().detach(), actions).mean()
     (expected,) = torch.autograd.grad(loss, policy.net.flat)
     assert torch.allclose(policy.net.flat.grad, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("size", "steps", "end", "taken"),
+    [
+        (1.0, 5, 0.5, 1),  # too long at once: half of it is not
+        (0.2, 5, 0.5, 3),  # 0.2, 0.4, and of the third a half
+        (0.2, 2, 0.4, 2),  # within the bound to the end
+        (1e6, 5, 0.0, 0),  # far too long, however often it is halved
+        (float("nan"), 5, 0.0, 0),
+        (0.2, 0, 0.0, 0),
+    ],
+)
+def test_the_step_that_leaves_the_bound_is_shortened_and_the_last(size, steps, end, taken):
+    """Along a line on which the KL is the square of the place; the bound is at 0.3."""
+    x = torch.zeros(1)
+    found = imitate_within(
+        0.3, steps, x.clone, x.copy_, lambda: x.add_(size), lambda: x.square().item()
+    )
+    assert x.item() == pytest.approx(end) and found[1] == taken
+    assert found[0] == pytest.approx(end**2, abs=1e-6)

@@ -28,11 +28,10 @@ from torch.distributions import Normal, kl_divergence
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from goalgan_bt.agent.rollout import Float32
-from goalgan_bt.agent.trpo import line_search
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.recall.backtracking import BacktrackingModel
 from goalgan_bt.recall.forward import ForwardModel
-from goalgan_bt.recall.imitation import faded
+from goalgan_bt.recall.imitation import faded, imitate_within
 from goalgan_bt.recall.settings import BacktrackingConfig, RecallConfig
 from goalgan_bt.recall.traces import recall_traces
 from goalgan_bt.runs import checkpoint
@@ -42,7 +41,6 @@ EDGE = 0.999  # of the range of a squashed action, beyond which its inverse is t
 MOST = 5.0  # standard deviations from the mean at which a number of an observation is cut off
 FAR = 3.0  # root mean square of the standard deviations from what was seen at which a trace ends
 WAYS = 4  # that a forward model imagines from a state; the best is imitated
-HALVINGS = 10  # of a step of imitation that is too long
 KL_SAMPLE = 1024  # states on which the KL of an imitation is bounded
 
 
@@ -415,37 +413,32 @@ class RecallTraces(BaseCallback):
         with torch.no_grad():
             old, before = self._gaussian(reference), self._gaussian(obs)
             log_pi = (before.log_prob(goals) + slope).sum(dim=1).mean().item()
-        max_kl = self.max_kl()
-        loss, kl, params = np.nan, 0.0, list(self._learner.parameters())
+        params, losses = list(self._learner.parameters()), []
 
-        @torch.no_grad()
-        def evaluate(candidate: Tensor) -> tuple[float, float]:
-            vector_to_parameters(candidate, params)
-            new_kl = kl_divergence(old, self._gaussian(reference)).sum(dim=1).mean()
-            return 1.0, new_kl.item()  # any step is taken that is short enough
-
-        for step in range(self.cfg.imitation_steps):
+        def step() -> None:
             some = torch.from_numpy(self._rng.integers(len(obs), size=self.cfg.imitation_batch))
             found = self._gaussian(obs[some])
             std = found.stddev.detach()
             miss = -Normal(found.mean, std).log_prob(goals[some]).sum(dim=1).mean()
-            if step == 0:
-                loss = miss.item()
-            start = parameters_to_vector(params).detach()
+            losses.append(miss.item())
             self._optimiser.zero_grad()
             miss.backward()
             self._optimiser.step()
-            full_step = parameters_to_vector(params).detach() - start
-            accepted = None  # for a policy as narrow as SAC's nearly every full step is too long
-            if torch.isfinite(full_step).all():
-                accepted = line_search(evaluate, start, full_step, max_kl, HALVINGS + 1, 0.5)
-            if accepted is None:
-                vector_to_parameters(start, params)
-                break
-            there, _, kl = accepted  # and in place: the last that was tried
-            if not torch.equal(there, start + full_step):
-                break  # shortened: it has reached the bound
-        return {"loss": loss, "kl": kl, "log_pi": log_pi}
+
+        @torch.no_grad()
+        def kl() -> float:
+            return kl_divergence(old, self._gaussian(reference)).sum(dim=1).mean().item()
+
+        # For a policy as narrow as SAC's nearly every full step is too long.
+        kl_there, _ = imitate_within(
+            self.max_kl(),
+            self.cfg.imitation_steps,
+            lambda: parameters_to_vector(params).detach(),
+            lambda vector: vector_to_parameters(vector, params),
+            step,
+            kl,
+        )
+        return {"loss": losses[0], "kl": kl_there, "log_pi": log_pi}
 
     def state_dict(self) -> dict[str, Any]:
         """Settings, model and trajectories, to go on with a saved agent.

@@ -3,9 +3,10 @@
 The policy sees the goal that seeded the trace, which the trace reaches by construction. The
 gradient goes through the mean only: actions of unit variance would otherwise blow up the policy's
 standard deviation. A bound on the KL from the policy as it was keeps imitation from undoing the
-trust-region step before it.
+trust-region step before it: `imitate_within`, which serves other agents too.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -13,14 +14,60 @@ from torch import Tensor
 
 from goalgan_bt.agent.networks import Linearised
 from goalgan_bt.agent.policy import GaussianPolicy, log_prob, mean_kl
+from goalgan_bt.agent.trpo import line_search
 from goalgan_bt.recall.settings import ImitationConfig
 from goalgan_bt.runs import checkpoint, ranks
+
+HALVINGS = 10  # of a step that is too long, before it is given up
 
 
 def faded(max_kl: float, at: float, end: float | None) -> float:
     """A bound on the KL that falls on a line to zero at `end`, from there on nothing is imitated;
     without an end it stays."""
     return max_kl if end is None else max_kl * (1 - min(1.0, at / end))
+
+
+def imitate_within(
+    max_kl: float,
+    steps: int,
+    read: Callable[[], Tensor],
+    put: Callable[[Tensor], None],
+    step: Callable[[], None],
+    kl: Callable[[], float],
+) -> tuple[float, int]:
+    """Take gradient steps while the policy stays within a bound on the KL from where it was. The
+    step that would leave it is shortened, by halves, until it stays, and is the last.
+
+    Args:
+        max_kl: the bound, nats.
+        steps: to take at most.
+        read, put: give and set the parameters as a vector, (p,).
+        step: takes a step of the optimiser.
+        kl: from the policy as it was to the policy as it is, nats.
+
+    Returns:
+        The KL at the end, and the steps taken, a shortened one included.
+    """
+
+    def evaluate(candidate: Tensor) -> tuple[float, float]:
+        put(candidate)
+        return 1.0, kl()  # any step is taken that is short enough
+
+    reached = 0.0
+    for taken in range(steps):
+        start = read()
+        step()
+        full_step = read() - start
+        found = None
+        if torch.isfinite(full_step).all():
+            found = line_search(evaluate, start, full_step, max_kl, HALVINGS + 1, 0.5)
+        if found is None:
+            put(start)
+            return reached, taken
+        there, _, reached = found  # and in place: the last that was tried
+        if not torch.equal(there, start + full_step):
+            return reached, taken + 1
+    return reached, steps
 
 
 class Imitation:
@@ -39,7 +86,7 @@ class Imitation:
     def update(
         self, obs: Tensor, actions: Tensor, reference: Tensor, progress: float
     ) -> dict[str, float]:
-        """Take up to `cfg.steps` steps, fewer if the KL bound is met.
+        """Take up to `cfg.steps` steps within the bound on the KL (see `imitate_within`).
 
         Args:
             obs: (n, obs_dim) normalised observations of the traces; none is fine.
@@ -58,25 +105,36 @@ class Imitation:
         with torch.no_grad():
             old_mean, old_log_std = self.policy(reference)
         everybodys = ranks.count(len(reference))
-        first_loss, kl, taken = float("nan"), 0.0, 0
-        for _ in range(self.cfg.steps):
+        losses: list[float] = []
+
+        def step() -> None:
             rows = torch.randint(len(obs), (self.cfg.batch,), generator=self._rng)
             at = Linearised(self.policy.net, obs[rows])
-            if taken == 0:
-                first_loss = -log_prob(at.output, old_log_std, actions[rows]).mean().item()
+            if not losses:
+                losses.append(-log_prob(at.output, old_log_std, actions[rows]).mean().item())
             # The gradient of -log pi(a | s) in the mean.
             u = (at.output - actions[rows]) * torch.exp(-2 * old_log_std) / len(rows)
-            before = params.detach().clone()
             params.grad = at.vjp(u)
             self.optimiser.step()
-            with torch.no_grad():
-                kls = len(reference) * mean_kl(old_mean, old_log_std, *self.policy(reference))
-                new_kl = ranks.total(kls).item() / everybodys
-                if not new_kl <= max_kl:
-                    params.copy_(before)
-                    break
-            kl, taken = new_kl, taken + 1
-        return {"loss": first_loss, "kl": kl, "steps": float(taken)}
+
+        def put(vector: Tensor) -> None:
+            params.data.copy_(vector)
+
+        @torch.no_grad()
+        def kl() -> float:
+            kls = len(reference) * mean_kl(old_mean, old_log_std, *self.policy(reference))
+            return ranks.total(kls).item() / everybodys
+
+        kl_there, taken = imitate_within(
+            max_kl,
+            self.cfg.steps,
+            lambda: params.detach().clone(),
+            put,
+            step,
+            kl,
+        )
+        loss = losses[0] if losses else float("nan")
+        return {"loss": loss, "kl": kl_there, "steps": float(taken)}
 
     def state_dict(self) -> dict[str, Any]:
         """The optimiser's state."""
