@@ -1,6 +1,6 @@
 """The worlds: batched goal-reaching tasks on numpy and MuJoCo; nothing of learning in them.
 
-`make` builds one by name; `GoalEnv` in `goalgan_bt.envs.batch` is the contract.
+`make` builds one by name; `GoalEnv` in `goalgan_bt.envs.goal_env` is the contract.
 """
 
 from pathlib import Path

@@ -16,7 +16,7 @@ class PhysicsError(ValueError):
 
 
 class Step(NamedTuple):
-    """What one action in n simulations gave; its arrays belong to who asked for it.
+    """What one action in n simulations gave; its arrays are copies.
 
     states: (n, state_dim) afterwards.
     achieved: (n, goal_dim) the goals on which they stand.

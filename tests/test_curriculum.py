@@ -93,6 +93,12 @@ def test_a_file_that_is_none_is_refused_in_one_line(tmp_path, data):
         GoalCurriculum.load(tmp_path / "none.pt")
 
 
+def oracle():
+    curriculum = GoalCurriculum(LOW, HIGH, goals=GoalsConfig(source="oracle"))
+    curriculum.begin(np.array([LOW]))
+    return curriculum
+
+
 def asked():
     curriculum = GoalCurriculum(LOW, HIGH)
     curriculum.ask(1)
@@ -113,6 +119,7 @@ def asked():
         (lambda: asked().success(LOW), "rows of 3 numbers"),
         (lambda: asked().ask(-1), "0 or more, not -1"),
         (lambda: asked().ask(1.5), "not 1.5"),
+        (lambda: oracle().ask(1), "they need the world"),
         (lambda: GoalCurriculum(HIGH, LOW), "low must be less than high"),
         (lambda: GoalCurriculum([0.0], [np.inf]), "both finite"),
         (lambda: GoalCurriculum([0.0], [1.0, 2.0]), "corners of a box"),

@@ -232,7 +232,15 @@ class GoalCurriculum:
 
     def propose(self, n: int) -> FloatArray:
         """New goals, (n, goal_dim): the GAN's (or ALP-GMM's), and where the settings want it some
-        from anywhere, lest a GAN that has closed in on mastered goals hears of no others."""
+        from anywhere, lest a GAN that has closed in on mastered goals hears of no others.
+
+        Raises:
+            UsageError: for a source that must know the world (`goalgan_bt.curriculum.baselines`).
+        """
+        if self.cfg.source in ("feasible", "oracle"):
+            raise UsageError(
+                f"a curriculum alone cannot propose {self.cfg.source!r} goals: they need the world"
+            )
         if self.alp_gmm is not None:
             return self.alp_gmm.sample(n)
         if self.cfg.source == "uniform":

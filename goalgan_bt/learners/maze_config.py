@@ -33,8 +33,9 @@ class MazeConfig(RunConfig):
     env: str = "ant_umaze"
     """Environment: {point,ant}_{umaze,spiral,medium,large} or point_nd. Picks the preset."""
     method: str = "recall_traces"
-    """What to learn with: recall_traces, or one of the baselines and controls of methods.py. Picks
-    settings; other flags come on top."""
+    """What to learn with: recall_traces, recall_traces_paper; without traces goal_gan, gan_fit_all,
+    uniform, feasible, oracle, alp_gmm; the controls no_imitation, random_model, self_imitation,
+    hindsight, value_seeds, forward_model. Picks settings; other flags come on top."""
     resume: Path | None = None
     """Go on with this run (its folder): its settings are the defaults, and its limits, which count
     from its beginning, hold unless others are given. With later limits the exploration noise goes

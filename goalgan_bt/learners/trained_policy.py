@@ -60,7 +60,9 @@ class TrainedPolicy:
     def act(
         self, observation: ArrayLike, goal: ArrayLike, deterministic: bool = True
     ) -> NDArray[np.float64]:
-        """What the body shall do, (act_dim,) or (n, act_dim) in [-1, 1].
+        """What the body shall do, (act_dim,) or (n, act_dim) in [-1, 1]: for `GoalEnv.advance`, or
+        the motors of a body like it. (`GoalEnv.step` takes what the policy says instead, which for
+        the Ant is in another numbering of its legs.)
 
         Args:
             observation: the state of the body, (state_dim,) or (n, state_dim): for the point its

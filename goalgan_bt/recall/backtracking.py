@@ -2,9 +2,10 @@
 
     q(ds_t, a_t | s_{t+1}) = q(ds_t | a_t, s_{t+1}) q(a_t | s_{t+1}),   ds_t = s_t - s_{t+1}
 
-Two networks, trained by maximum likelihood (equation 2) on the transitions of trajectories that
-reached their goal, and unrolled backward from a state: s_t = s_{t+1} + ds_t. The state here is the
-body's physical state (positions and velocities), without the goal: physics does not know it.
+Two networks, trained by maximum likelihood (equation 2) on transitions of trajectories (the paper:
+those that reached their goal; by default all that did not fall), and unrolled backward from a
+state: s_t = s_{t+1} + ds_t. The state here is the body's physical state (positions and velocities),
+without the goal: physics does not know it.
 """
 
 import math
@@ -18,6 +19,7 @@ from torch import Tensor, nn
 from goalgan_bt.agent.networks import MLP, RELU, TANH, Linearised, first_weights
 from goalgan_bt.recall.settings import BacktrackingConfig
 from goalgan_bt.runs import checkpoint
+from goalgan_bt.runs.errors import UsageError
 
 Array = NDArray[np.floating]
 
@@ -140,7 +142,7 @@ class BacktrackingModel(nn.Module):
             before those steps, held_out_action_nll and held_out_state_nll of the unseen rows.
 
         Raises:
-            ValueError: if the arrays do not fit each other or the model.
+            UsageError: if the arrays do not fit each other or the model.
         """
         rows, (state_dim, act_dim, goal_dim) = len(states), self.sizes
         data = states, actions, next_states, np.empty((rows, 0)) if goals is None else goals
@@ -149,7 +151,7 @@ class BacktrackingModel(nn.Module):
             names, data, (state_dim, act_dim, state_dim, goal_dim), strict=True
         ):
             if np.shape(array) != (rows, size) or not rows:
-                raise ValueError(
+                raise UsageError(
                     f"{name} must be {max(rows, 1)} rows of {size} numbers, "
                     f"not an array of shape {np.shape(array)}"
                 )

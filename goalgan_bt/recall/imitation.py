@@ -1,6 +1,6 @@
 """Imitation of recall traces: maximise sum log pi(a_t | s_t, g) (Recall Traces, equation 3).
 
-The policy sees the goal that seeded the trace, which the trace reaches by construction. The
+The policy sees a goal that the trace reaches by construction: a later place of it, or its end. The
 gradient goes through the mean only: actions of unit variance would otherwise blow up the policy's
 standard deviation. A bound on the KL from the policy as it was keeps imitation from undoing the
 trust-region step before it: `imitate_within`, which serves other agents too.

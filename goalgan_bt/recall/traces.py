@@ -11,6 +11,7 @@ from goalgan_bt.envs.goal_env import GoalEnv
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.recall.backtracking import BacktrackingModel
 from goalgan_bt.recall.transitions import Steps
+from goalgan_bt.runs.errors import UsageError
 
 Float32 = NDArray[np.float32]
 
@@ -71,12 +72,12 @@ def recall_traces(
             of a quaternion; nothing if None.
 
     Raises:
-        ValueError: if seeds or goals do not fit the model.
+        UsageError: if seeds or goals do not fit the model.
     """
     n, (state_dim, act_dim, goal_dim) = len(seeds), model.sizes
     goals = np.empty((n, 0)) if goals is None else goals
     if np.shape(seeds) != (n, state_dim) or (model.cfg.conditioned and goals.shape[1] != goal_dim):
-        raise ValueError(
+        raise UsageError(
             f"seeds must be rows of {state_dim} numbers and goals of {goal_dim}, "
             f"not arrays of shapes {np.shape(seeds)} and {goals.shape}"
         )

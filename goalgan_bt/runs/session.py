@@ -2,7 +2,7 @@
 
 Whatever learns, its loop is
 
-    with Session(folder, settings, limits) as run:
+    with Session(folder, settings, limits, schedule) as run:
         while run.goes_on():
             ...
             if run.measures():
