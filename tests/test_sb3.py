@@ -92,6 +92,11 @@ def test_agents_learn_with_recall_traces(name, steps, good, tmp_path):
     assert continued > good - 4
 
 
+def imitate(callback, states, actions, seen):
+    """As a turn does, within the bound of the moment."""
+    return callback.imitation.update(states, actions, seen, callback.max_kl())
+
+
 def test_trajectories_are_what_happened():
     env = make_vec_env(Reach, n_envs=3, seed=0)
     callback = recall()
@@ -117,14 +122,14 @@ def test_rewards_are_the_environments_own_where_they_are_normalised():
 def test_the_threshold_is_a_percentile_and_the_memory_has_an_end():
     callback = RecallTraces(RecallConfig(top_percent=20, capacity=100, min_steps=20))
     for i in range(50):
-        path = [(np.zeros(2), np.zeros(2), float(i % 10))] * 5
-        callback._remember(path, np.zeros(2), False)
+        callback.remember(Trajectory(np.zeros((6, 2)), np.zeros((5, 2)), np.full(5, i % 10), False))
     assert sum(len(one.rewards) for one in callback.trajectories) == 100
     chosen, threshold = callback.best()
     assert threshold == 5 * 8 and len(chosen) == 4  # of 20 trajectories those of 8 and 9 a step
     callback = recall(top_percent=20)
     for i in range(100):  # sparse reward: one in twenty gets there
-        callback._remember([(np.zeros(2), np.zeros(2), float(i % 20 == 0))], np.zeros(2), True)
+        won = np.array([float(i % 20 == 0)])
+        callback.remember(Trajectory(np.zeros((2, 2)), np.zeros((1, 2)), won, True))
     chosen, threshold = callback.best()
     assert threshold == 1 and len(chosen) == 5
     callback.trajectories.clear()
@@ -146,7 +151,7 @@ def test_imitation_moves_the_mean(name):
 
     def now():
         with torch.no_grad():
-            found = callback._gaussian(obs)
+            found = callback.agent.gaussian(obs)
             mean = (
                 torch.tanh(found.mean) if name == "SAC" else found.mean / torch.tensor([0.2, 0.4])
             )
@@ -154,7 +159,7 @@ def test_imitation_moves_the_mean(name):
 
     (mean, std), kl = now(), 0.0
     for _ in range(10):
-        kl = max(kl, callback._imitate(states, towards, states)["kl"])
+        kl = max(kl, imitate(callback, states, towards, states)["kl"])
     new_mean, new_std = now()
     assert 0 < kl <= 0.05
     gap, new_gap = (np.abs(x - towards).mean() for x in (mean, new_mean))
@@ -171,13 +176,13 @@ def test_a_step_that_is_too_long_is_shortened(name):
     model.learn(300, callback=callback)
     states = np.random.default_rng(0).uniform(-1, 1, (400, 2))
     towards = np.tile([0.5, -0.5], (400, 1))
-    found = [callback._imitate(states, towards, states) for _ in range(20)]
+    found = [imitate(callback, states, towards, states) for _ in range(20)]
     assert all(0 < one["kl"] <= 1e-4 for one in found)
     assert found[-1]["log_pi"] > found[0]["log_pi"]
-    callback._optimiser.param_groups[0]["lr"] = 1e6
-    known = [param.detach().clone() for param in callback._learner.parameters()]
-    assert callback._imitate(states, towards, states)["kl"] == 0
-    assert all(map(torch.equal, known, callback._learner.parameters()))
+    callback.imitation.optimiser.param_groups[0]["lr"] = 1e6
+    known = [param.detach().clone() for param in callback.agent.actor.parameters()]
+    assert imitate(callback, states, towards, states)["kl"] == 0
+    assert all(map(torch.equal, known, callback.agent.actor.parameters()))
 
 
 def test_agents_that_are_not_gaussian_are_refused():
@@ -270,10 +275,10 @@ def test_learning_goes_on_where_it_was_or_anew():
     env = make_vec_env(Reach, n_envs=2, seed=0)
     model, callback = agent("PPO", env, n_steps=40, batch_size=80), recall()
     model.learn(80, callback=callback)  # 40 steps each: an episode of 30 and 10 of the next
-    assert [len(path) for path in callback._paths] == [10, 10]
+    assert callback.unfinished == [10, 10]
     model.learn(80, callback=callback, reset_num_timesteps=False)
     assert {len(one.rewards) for one in callback.trajectories} == {30}
-    assert [len(path) for path in callback._paths] == [20, 20]
+    assert callback.unfinished == [20, 20]
     before = len(callback.trajectories)
     model.learn(80, callback=callback)
     assert {len(one.rewards) for one in callback.trajectories} == {30}
@@ -293,12 +298,12 @@ def test_the_bound_fades_and_then_nothing_is_recalled():
     assert callback.last["kl"] > 0
     assert callback.max_kl() == pytest.approx(0.01 * (1 - 4608 / 6000))
     strong = {"imitation_steps": 200, "learning_rate": 1e-3, "max_kl": 0.01}
-    callback.cfg = RecallConfig(fade_steps=6000, **strong)
+    callback.cfg = callback.imitation.cfg = RecallConfig(fade_steps=6000, **strong)
     states = np.random.default_rng(0).uniform(-1, 1, (200, 2))
     callback.num_timesteps = 5990
-    assert callback._imitate(states, np.ones((200, 2)), states)["kl"] <= 0.01 * 10 / 6000
+    assert imitate(callback, states, np.ones((200, 2)), states)["kl"] <= 0.01 * 10 / 6000
     callback.num_timesteps = 3000
-    assert callback._imitate(states, np.ones((200, 2)), states)["kl"] > 0.001
+    assert imitate(callback, states, np.ones((200, 2)), states)["kl"] > 0.001
     model.learn(3000, callback=callback, reset_num_timesteps=False)
     assert callback.last == {} and callback.max_kl() == 0
 
@@ -337,14 +342,14 @@ def test_the_forward_control_imitates_what_it_imagined_to_end_well(name, monkeyp
     assert {"forward_nll", "valid", "loss", "kl"} <= set(callback.last)
     # In a model in which nothing stands in the way: places add up, and it is good to be right.
     monkeypatch.setattr(callback.dynamics, "successors", lambda s, a: s + 0.1 * a)
-    monkeypatch.setattr(callback, "_values", lambda obs: obs[:, 0])
+    monkeypatch.setattr(callback.agent, "values", lambda obs: obs[:, 0])
     space = Seen(np.random.default_rng(0).uniform(-1, 1, (500, 2)), 2)
 
     def ends(ways):
         """How far to the right it gets on the mean, always from the same place."""
         monkeypatch.setattr(stable_baselines, "WAYS", ways)
         begins = np.full((1, 2), 0.1, np.float32)
-        states, actions, valid = callback._imagine(callback.dynamics, space, begins)
+        states, actions, valid = callback.imagine(callback.dynamics, space, begins)
         assert valid.shape == (5, 60 * ways) and valid.all() and abs(actions).max() <= 1
         paths, moves = states.reshape(5, 60, 2), actions.reshape(5, 60, 2)
         np.testing.assert_allclose(paths[1:], paths[:-1] + 0.1 * moves[:-1], rtol=1e-5, atol=1e-6)
@@ -384,7 +389,9 @@ def test_what_is_remembered_is_not_normalised(name, monkeypatch):
         scaled = one.actions * FASTEST
         np.testing.assert_allclose(moved[inside], scaled[inside], atol=1e-4)
     told = []
-    monkeypatch.setattr(callback, "_values", lambda obs: told.append(obs) or np.zeros(len(obs)))
+    monkeypatch.setattr(
+        callback.agent, "values", lambda obs: told.append(obs) or np.zeros(len(obs))
+    )
     callback.turn()
     chosen, _ = callback.best()
     after = np.concatenate([one.obs[1:] for one in chosen])
@@ -396,7 +403,7 @@ def test_traces_begin_where_it_pays_to_be(monkeypatch):
     callback = recall(traces=1)
     model = agent("PPO", make_vec_env(Reach, n_envs=1, seed=0))
     model.learn(256, callback=callback)
-    callback._values = lambda obs: obs[:, 0] * 10  # the critic likes the right
+    callback.agent.values = lambda obs: obs[:, 0] * 10  # the critic likes the right
     begun, unroll = [], stable_baselines.recall_traces
     monkeypatch.setattr(
         stable_baselines,
@@ -504,7 +511,7 @@ def test_the_likelihood_told_is_that_of_the_policy(name):
         else:  # whose actions are the environment's: a smaller unit, a higher density
             scale = torch.from_numpy(FASTEST)
             said = model.policy.evaluate_actions(obs, done * scale)[1] + scale.log().sum()
-    told = callback._imitate(states, actions, states)
+    told = imitate(callback, states, actions, states)
     assert told["log_pi"] == pytest.approx(said.mean().item(), rel=1e-4)
 
 
@@ -522,7 +529,7 @@ def test_the_ratio_told_is_of_policy_and_model(monkeypatch):
         return traces
 
     monkeypatch.setattr(stable_baselines, "recall_traces", cut)
-    monkeypatch.setattr(callback, "_imitate", lambda s, a, seen: {"log_pi": 7.0})
+    monkeypatch.setattr(callback.imitation, "update", lambda s, a, seen, max_kl: {"log_pi": 7.0})
     told = callback.turn()
     ((seeds, (states, actions, valid)),) = [(s, t[:3]) for s, t in found]
     densities = []
@@ -556,7 +563,7 @@ def test_the_optimiser_goes_on_where_it_was(tmp_path):
         again.load_state_dict(callback.state_dict())
     assert len(again.trajectories) == len(callback.trajectories)
     again.init_callback(model)
-    ours, theirs = (one._optimiser.state_dict()["state"] for one in (callback, again))
+    ours, theirs = (one.imitation.optimiser.state_dict()["state"] for one in (callback, again))
     assert ours and ours.keys() == theirs.keys()
     assert all(torch.equal(ours[i]["exp_avg"], theirs[i]["exp_avg"]) for i in ours)
 
@@ -571,7 +578,7 @@ def test_rewards_and_values_are_added_in_the_critics_units(monkeypatch):
         "recall_traces",
         lambda model, seeds, *a, **k: begun.append(seeds[0]) or unroll(model, seeds, *a, **k),
     )
-    callback._values = lambda obs: 1.0 * (obs[:, 0] > np.median(obs[:, 0]))
+    callback.agent.values = lambda obs: 1.0 * (obs[:, 0] > np.median(obs[:, 0]))
     line = np.linspace(-1, 1, 201)
     obs, rewards = np.column_stack([line, line]), np.zeros(200)
     rewards[50] = 5.0  # in the half of no value
@@ -595,7 +602,7 @@ def test_the_value_beside_sac_is_the_lower_of_its_critics():
         both = model.critic(obs, model.actor(obs, deterministic=True))
     lower = torch.minimum(*both)[:, 0]
     assert not torch.equal(lower, both[0][:, 0])
-    np.testing.assert_allclose(callback._values(states), lower, rtol=1e-5)
+    np.testing.assert_allclose(callback.agent.values(states), lower, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["SAC", "PPO"])
@@ -605,13 +612,13 @@ def test_imitation_ends_where_the_bound_is_reached(name):
     model = agent(name, make_vec_env(Reach, n_envs=1, seed=0))
     model.learn(300, callback=callback)
     states = np.random.default_rng(0).uniform(-1, 1, (400, 2))
-    assert callback._imitate(states, np.full((400, 2), 0.5), states)["kl"] > 0
-    (taken,) = {int(one["step"]) for one in callback._optimiser.state.values()}
+    assert imitate(callback, states, np.full((400, 2), 0.5), states)["kl"] > 0
+    (taken,) = {int(one["step"]) for one in callback.imitation.optimiser.state.values()}
     assert taken == 1
-    callback._optimiser.param_groups[0]["lr"] = np.nan
-    known = [param.detach().clone() for param in callback._learner.parameters()]
-    assert callback._imitate(states, np.full((400, 2), 0.5), states)["kl"] == 0
-    assert all(map(torch.equal, known, callback._learner.parameters()))
+    callback.imitation.optimiser.param_groups[0]["lr"] = np.nan
+    known = [param.detach().clone() for param in callback.agent.actor.parameters()]
+    assert imitate(callback, states, np.full((400, 2), 0.5), states)["kl"] == 0
+    assert all(map(torch.equal, known, callback.agent.actor.parameters()))
 
 
 def test_every_turn_learns_from_all_that_is_remembered_and_its_time_counts(monkeypatch):

@@ -14,34 +14,28 @@ observation: the environment need know nothing of us.
 import time
 from collections import deque
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.sac.policies import SACPolicy
-from torch import Tensor
-from torch.distributions import Normal, kl_divergence
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from goalgan_bt.agent.rollout import Float32
 from goalgan_bt.envs.maze import BoolArray, FloatArray
+from goalgan_bt.learners.gaussian_agent import AgentImitation, GaussianAgent
 from goalgan_bt.recall.backtracking import BacktrackingModel
 from goalgan_bt.recall.forward import ForwardModel
-from goalgan_bt.recall.imitation import faded, imitate_within
+from goalgan_bt.recall.imitation import faded
 from goalgan_bt.recall.settings import BacktrackingConfig, RecallConfig
 from goalgan_bt.recall.traces import recall_traces
 from goalgan_bt.runs import checkpoint
 from goalgan_bt.runs.signals import Stop
 
-EDGE = 0.999  # of the range of a squashed action, beyond which its inverse is taken as there
 MOST = 5.0  # standard deviations from the mean at which a number of an observation is cut off
 FAR = 3.0  # root mean square of the standard deviations from what was seen at which a trace ends
 WAYS = 4  # that a forward model imagines from a state; the best is imitated
-KL_SAMPLE = 1024  # states on which the KL of an imitation is bounded
 
 
 class Trajectory(NamedTuple):
@@ -97,7 +91,7 @@ class RecallTraces(BaseCallback):
         trajectories: what is remembered, the newest last; dynamics: the backtracking model (or the
             forward one, see `RecallConfig.model`), once learning has begun; last: what the last
             turn gave (see `turn`); seconds: what all of it took, the turns and what is remembered
-            at each step.
+            at each step; agent, imitation: of the agent that learns, and how it imitates.
 
     Raises:
         ValueError: for settings that make no sense.
@@ -118,7 +112,8 @@ class RecallTraces(BaseCallback):
         self._rng, self._noise = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
         self._remembered, self._turned = 0, 0
         self._moments: dict[str, Any] | None = None  # of a saved optimiser
-        self._agent: Any = None  # whose policy the optimiser is for
+        self.agent: GaussianAgent | None = None
+        self.imitation: AgentImitation | None = None
         self._sizes = (0, 0)  # of observations and actions of the model
         self._now: FloatArray = np.empty(0)  # observations before the next step
         self._learning = False  # until `learn` has come to its end
@@ -135,39 +130,32 @@ class RecallTraces(BaseCallback):
             return BacktrackingModel(obs_dim, act_dim, cfg=cfg, generator=self._noise)
 
     def _init_callback(self) -> None:
-        policy: Any = self.model.policy
-        space, actions = self.model.observation_space, self.model.action_space
-        known = isinstance(policy, (ActorCriticPolicy, SACPolicy))
-        if not known or hasattr(policy, "lstm_actor") or self.model.use_sde:
-            raise TypeError(
-                "RecallTraces needs an agent with a Gaussian policy, without memory or "
-                "state-dependent exploration: SAC, TRPO, PPO or A2C"
-            )
-        if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
-            raise TypeError(f"RecallTraces needs observations that are vectors, not {space}")
-        if not (isinstance(actions, spaces.Box) and len(actions.shape) == 1):
-            raise TypeError(f"RecallTraces needs actions that are vectors of numbers: {actions}")
-        if not (actions.high > actions.low).all():
-            raise TypeError(f"RecallTraces needs actions that can vary in every number: {actions}")
-        self._squashed = isinstance(policy, SACPolicy)
-        self._learner = policy.actor if self._squashed else policy
-        self._low, self._high = actions.low.astype(float), actions.high.astype(float)
-        sizes = space.shape[0], actions.shape[0]
-        if self.dynamics is None or (sizes != self._sizes and not self.trajectories):
-            self.dynamics = self._new_model(*sizes)
-        if sizes != self._sizes:
+        agent = GaussianAgent(self.model)
+        if self.dynamics is None or (agent.sizes != self._sizes and not self.trajectories):
+            self.dynamics = self._new_model(*agent.sizes)
+        if agent.sizes != self._sizes:
             raise ValueError(
                 f"this RecallTraces remembers observations and actions of {self._sizes} numbers, "
-                f"the agent's have {sizes}: take a new one"
+                f"the agent's have {agent.sizes}: take a new one"
             )
-        if self._agent is not self.model:
-            self._agent, self._turned = self.model, self.model.num_timesteps
-            self._optimiser = torch.optim.Adam(self._learner.parameters(), self.cfg.learning_rate)
+        if self.agent is None or self.agent.model is not self.model:
+            self.agent, self._turned = agent, self.model.num_timesteps
+            self.imitation = AgentImitation(agent, self.cfg, self._rng)
             self._paths: list[list[tuple[Any, Any, float]]] = [[] for _ in range(self.model.n_envs)]
             self._whole = np.zeros(self.model.n_envs, dtype=bool)  # seen from their beginning
-        if self._moments is not None and _fit(self._moments, self._optimiser):
-            checkpoint.restore(self._optimiser, self._moments)
+        if self._moments is not None and _fit(self._moments, self._imitating.optimiser):
+            checkpoint.restore(self._imitating.optimiser, self._moments)
         self._moments = None
+
+    @property
+    def _acting(self) -> GaussianAgent:
+        assert self.agent is not None
+        return self.agent
+
+    @property
+    def _imitating(self) -> AgentImitation:
+        assert self.imitation is not None
+        return self.imitation
 
     def _on_training_start(self) -> None:
         self._normalising = self.model.get_vec_normalize_env()
@@ -208,7 +196,7 @@ class RecallTraces(BaseCallback):
         begin = time.perf_counter()
         given = self.locals
         actions = given.get("clipped_actions", given["actions"])
-        told = self._told(actions)
+        told = self._acting.in_unit(actions)
         normalising, rewards = self._normalising, given["rewards"]
         if normalising is not None:
             rewards = normalising.get_original_reward()
@@ -221,20 +209,24 @@ class RecallTraces(BaseCallback):
                 last, timeout = info["terminal_observation"], info.get("TimeLimit.truncated", False)
                 if normalising is not None:
                     last = normalising.unnormalize_obs(last)
-                self._remember(path, last, not timeout)
+                obs, actions, rewards_of = map(np.array, zip(*path, strict=True))
+                whole = np.concatenate([obs, last[None]])
+                self.remember(Trajectory(whole, actions, rewards_of, not timeout))
             path.clear()
             self._whole[i] = True
         self._now = self._original(given["new_obs"])
         self.seconds += time.perf_counter() - begin
         return True
 
-    def _remember(
-        self, path: list[tuple[Any, Any, float]], last_obs: FloatArray, terminated: bool
-    ) -> None:
-        obs, actions, rewards = map(np.array, zip(*path, strict=True))
-        ended = Trajectory(np.concatenate([obs, last_obs[None]]), actions, rewards, terminated)
+    @property
+    def unfinished(self) -> list[int]:
+        """Steps of each environment's episode so far that is going on."""
+        return [len(path) for path in self._paths]
+
+    def remember(self, ended: Trajectory) -> None:
+        """Take in an episode; the oldest make room."""
         self.trajectories.append(ended)
-        self._remembered += len(path)
+        self._remembered += len(ended.rewards)
         while self._remembered - len(self.trajectories[0].rewards) >= self.cfg.capacity:
             self._remembered -= len(self.trajectories.popleft().rewards)
 
@@ -296,18 +288,20 @@ class RecallTraces(BaseCallback):
         known, after = space.repair(states), space.repair(following)
         model = self.dynamics
         assert model is not None
+        imitate = partial(self._imitating.update, max_kl=self.max_kl())
         metrics = {"threshold": threshold, **lengths, **model.fit(known, actions, after)}
         if isinstance(model, ForwardModel):
-            told, done, valid = self._imagine(model, space, known)
+            told, done, valid = self.imagine(model, space, known)
             metrics["valid"] = float(valid.mean())
-            return metrics | (self._imitate(told, done, states) if len(told) else {})
+            return metrics | (imitate(told, done, states) if len(told) else {})
 
         worth = rewards
         if self.cfg.seeds == "value":  # of reaching a state: where it ends, nothing follows
             ends = np.cumsum([len(one.rewards) for one in chosen]) - 1
-            future = self._values(following)
+            future = self._acting.values(following)
             future[ends[[one.terminated for one in chosen]]] = 0.0
-            worth = rewards + self._agent.gamma * future
+            gamma: float = self.model.gamma  # type: ignore[attr-defined]
+            worth = rewards + gamma * future
         seeds = after[np.argsort(worth)[-self.cfg.traces :]].astype(float)
         traces = recall_traces(
             model, seeds, self.cfg.trace_length, valid=space.valid, repair=space.repair
@@ -318,11 +312,11 @@ class RecallTraces(BaseCallback):
             recalled = traces.states[traces.valid], traces.actions[traces.valid]
             happened = (torch.from_numpy(x).float() for x in (later, recalled[1]))
             log_q = model.action_log_density(*happened).mean().item()
-            metrics |= self._imitate(*recalled, states)
+            metrics |= imitate(*recalled, states)
             metrics["log_ratio"] = metrics["log_pi"] - log_q
         return metrics
 
-    def _imagine(
+    def imagine(
         self, model: ForwardModel, space: Seen, states: FloatArray
     ) -> tuple[Float32, Float32, BoolArray]:
         """Let the policy act in a forward model, `WAYS` times from each of some of the states
@@ -340,105 +334,15 @@ class RecallTraces(BaseCallback):
         valid = np.empty(told.shape[:2], dtype=bool)
         going = np.ones(len(now), dtype=bool)
         for t in range(self.cfg.trace_length):
-            told[t], done[t] = now, self._sample(now)
+            told[t], done[t] = now, self._acting.sample(now, self._noise)
             following = model.successors(*map(torch.from_numpy, (told[t], done[t]))).numpy()
             going &= space.valid(following)
             valid[t] = going
             now = np.where(going[:, None], space.repair(following), now)
-        worth = self._values(now).reshape(WAYS, -1)
+        worth = self._acting.values(now).reshape(WAYS, -1)
         best = np.arange(WAYS)[:, None] == worth.argmax(axis=0)
         kept = valid & best.ravel()
         return told[kept], done[kept], valid
-
-    def _gaussian(self, obs: Tensor) -> Normal:
-        """The policy before it is squashed or clipped."""
-        if self._squashed:
-            mean, log_std, _ = self._learner.get_action_dist_params(obs)
-            return Normal(mean, log_std.exp())
-        found = self._learner.get_distribution(obs).distribution
-        assert isinstance(found, Normal)
-        return found
-
-    @torch.no_grad()
-    def _sample(self, obs: FloatArray) -> FloatArray:
-        """Actions of the policy at observations (n, obs_dim), (n, act_dim) in [-1, 1]."""
-        found = self._gaussian(self._tensor(obs))
-        noise = self._tensor(torch.randn(found.mean.shape, generator=self._noise).numpy())
-        actions = (found.mean + found.stddev * noise).cpu().numpy()
-        return np.tanh(actions) if self._squashed else self._told(actions).clip(-1, 1)
-
-    def _told(self, actions: FloatArray) -> FloatArray:
-        """Actions of the environment's range in [-1, 1]."""
-        return 2 * (actions - self._low) / (self._high - self._low) - 1
-
-    def _tensor(self, array: FloatArray) -> Tensor:
-        return torch.as_tensor(array, dtype=torch.float32, device=self.model.device)
-
-    @torch.no_grad()
-    def _values(self, obs: FloatArray) -> FloatArray:
-        """What the critic says of observations (n, obs_dim), (n,)."""
-        told, policy = self._tensor(obs), cast(Any, self.model.policy)
-        if self._squashed:
-            judged = policy.critic(told, policy.actor(told, deterministic=True))
-            return torch.cat(judged, dim=1).amin(dim=1).cpu().numpy()
-        return policy.predict_values(told)[:, 0].cpu().numpy()
-
-    def _imitate(
-        self,
-        states: FloatArray,
-        actions: FloatArray,
-        seen: FloatArray,
-    ) -> dict[str, float]:
-        """Maximise log pi(a | s) of recalled steps. The gradient goes through the mean only; the
-        std of SAC's policy, which shares layers with the mean, may follow.
-
-        Args:
-            states, actions: (n, obs_dim), (n, act_dim) in [-1, 1].
-            seen: (m, obs_dim) states on which the KL is bounded.
-
-        Returns:
-            loss: -log pi, nats; kl: on those states; log_pi: log pi(a | s) before the imitation,
-            nats per step.
-        """
-        obs, goals = self._tensor(states), self._tensor(actions)
-        if self._squashed:
-            goals = torch.atanh(goals.clamp(-EDGE, EDGE))
-            slope = -torch.log1p(-torch.tanh(goals).square())  # of atanh
-        else:
-            half = self._tensor((self._high - self._low) / 2)
-            goals = self._tensor(self._low) + half * (goals + 1)
-            slope = half.log().expand_as(goals)
-        rows = self._rng.permutation(len(seen))[:KL_SAMPLE]
-        reference = self._tensor(seen[rows])
-        with torch.no_grad():
-            old, before = self._gaussian(reference), self._gaussian(obs)
-            log_pi = (before.log_prob(goals) + slope).sum(dim=1).mean().item()
-        params, losses = list(self._learner.parameters()), []
-
-        def step() -> None:
-            some = torch.from_numpy(self._rng.integers(len(obs), size=self.cfg.imitation_batch))
-            found = self._gaussian(obs[some])
-            std = found.stddev.detach()
-            miss = -Normal(found.mean, std).log_prob(goals[some]).sum(dim=1).mean()
-            losses.append(miss.item())
-            self._optimiser.zero_grad()
-            miss.backward()
-            self._optimiser.step()
-
-        @torch.no_grad()
-        def kl() -> float:
-            return kl_divergence(old, self._gaussian(reference)).sum(dim=1).mean().item()
-
-        # For a policy as narrow as SAC's nearly every full step is too long.
-        kl_there, _ = imitate_within(
-            self.max_kl(),
-            self.cfg.imitation_steps,
-            lambda: parameters_to_vector(params).detach(),
-            lambda vector: vector_to_parameters(vector, params),
-            step,
-            kl,
-        )
-        return {"loss": losses[0], "kl": kl_there, "log_pi": log_pi}
 
     def state_dict(self) -> dict[str, Any]:
         """Settings, model and trajectories, to go on with a saved agent.
@@ -448,7 +352,7 @@ class RecallTraces(BaseCallback):
         """
         if self.dynamics is None or not self.trajectories:
             raise ValueError("nothing was learned yet: save after the first episode of `learn`")
-        moments = self._optimiser.state_dict() if self._agent is not None else self._moments
+        moments = self._moments if self.imitation is None else self.imitation.optimiser.state_dict()
         return {
             "cfg": asdict(self.cfg),
             "model": self.dynamics.state_dict(),
