@@ -86,9 +86,11 @@ class RunWriter:
         path = self.folder / "frames" / f"{iteration:06d}.npz"
         write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
 
-    def close(self, how: str) -> None:
-        """Say how the run ended, and flush what TensorBoard buffers."""
-        end_run(self.folder, how)
+    def close(self, how: str | None) -> None:
+        """Say how the run ended, unless that is None, let go of the folder, and flush what
+        TensorBoard buffers."""
+        if how is not None:
+            end_run(self.folder, how)
         self._lock.close()
         if self._events is not None:
             self._events.close()

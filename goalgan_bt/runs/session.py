@@ -231,10 +231,12 @@ class Session:
         self.background.close()
         if self._terminal is not None:
             self._terminal.close()
+        if self._writer is None:
+            return
+        how = "complete" if self.complete else "stopped early: --resume goes on"
+        self._writer.close(how if error is None else None)
         if self.folder is not None and isinstance(error, OSError) and not self.folder.exists():
             raise RunError(f"the run folder {self.folder} has vanished: start again") from None
-        if self._writer is not None and error is None:
-            self._writer.close("complete" if self.complete else "stopped early: --resume goes on")
 
 
 def resident_mib() -> float:
