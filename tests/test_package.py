@@ -39,9 +39,14 @@ def test_the_wheel_is_complete_and_installs_one_package(built):
     names = zipfile.ZipFile(wheel).namelist()
     tops = {name.split("/")[0] for name in names}
     assert tops == {"goalgan_bt", next(t for t in tops if t.endswith(".dist-info"))}
-    ours = {f"goalgan_bt/{p.name}" for p in (ROOT / "goalgan_bt").glob("*.py")}
-    ours |= {f"goalgan_bt/envs/{p.name}" for p in (ROOT / "envs").glob("*.py")}
-    ours |= {f"goalgan_bt/viz/{p.name}" for p in (ROOT / "viz").glob("*.py")}
+    ours = {str(p.relative_to(ROOT)) for p in (ROOT / "goalgan_bt").rglob("*.py")}
+    ours |= {
+        f"goalgan_bt/{p.relative_to(ROOT)}"
+        for d in ("envs", "viz")
+        for p in (ROOT / d).rglob("*.py")
+    }
+    ours |= {str(p.relative_to(ROOT)) for p in (ROOT / "goalgan_bt/study").glob("*.toml")}
+    assert len(ours) > 100
     assert ours <= set(names) and "goalgan_bt/py.typed" in names
     assert "goalgan_bt/viz/export.html" in names
 
