@@ -68,21 +68,24 @@ def test_the_gradient_is_that_of_the_likelihood():
 
 
 @pytest.mark.parametrize(
-    ("size", "steps", "end", "taken"),
+    ("size", "steps", "halvings", "end", "taken"),
     [
-        (1.0, 5, 0.5, 1),  # too long at once: half of it is not
-        (0.2, 5, 0.5, 3),  # 0.2, 0.4, and of the third a half
-        (0.2, 2, 0.4, 2),  # within the bound to the end
-        (1e6, 5, 0.0, 0),  # far too long, however often it is halved
-        (float("nan"), 5, 0.0, 0),
-        (0.2, 0, 0.0, 0),
+        (1.0, 5, 10, 0.5, 1),  # too long at once: half of it is not
+        (0.2, 5, 10, 0.5, 3),  # 0.2, 0.4, and of the third a half
+        (0.2, 5, 0, 0.4, 2),  # the third is undone
+        (0.2, 2, 10, 0.4, 2),  # within the bound to the end
+        (1e6, 5, 10, 0.0, 0),  # far too long, however often it is halved
+        (float("nan"), 5, 10, 0.0, 0),
+        (0.2, 0, 10, 0.0, 0),
     ],
 )
-def test_the_step_that_leaves_the_bound_is_shortened_and_the_last(size, steps, end, taken):
+def test_the_step_that_leaves_the_bound_is_halved_or_undone_and_the_last(
+    size, steps, halvings, end, taken
+):
     """Along a line on which the KL is the square of the place; the bound is at 0.3."""
     x = torch.zeros(1)
     found = imitate_within(
-        0.3, steps, x.clone, x.copy_, lambda: x.add_(size), lambda: x.square().item()
+        0.3, steps, x.clone, x.copy_, lambda: x.add_(size), lambda: x.square().item(), halvings
     )
     assert x.item() == pytest.approx(end) and found[1] == taken
     assert found[0] == pytest.approx(end**2, abs=1e-6)

@@ -168,10 +168,10 @@ class ValueFunction(nn.Module):
                 at = Linearised(self.net, normalised[rows])
                 error = at.output - returns[rows, None]
                 gradient = at.vjp(error * (2 / len(minibatch)))
-                self.net.flat.grad = ranks.total(gradient, beside=True)
+                self.net.flat.grad = ranks.total(gradient, background=True)
                 self.optimiser.step()
                 losses.append(error.square().sum() / len(minibatch))
-        return {"loss": ranks.total(torch.stack(losses), beside=True).mean().item()}
+        return {"loss": ranks.total(torch.stack(losses), background=True).mean().item()}
 
     def get_extra_state(self) -> dict[str, Any]:
         """The optimiser's state, which goes into the `state_dict`."""

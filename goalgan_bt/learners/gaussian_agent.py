@@ -21,6 +21,7 @@ from goalgan_bt.recall.settings import RecallConfig
 
 EDGE = 0.999  # of the range of a squashed action, beyond which its inverse is taken as there
 KL_SAMPLE = 1024  # states on which the KL of an imitation is bounded
+HALVINGS = 10  # of a step that is too long: for a policy as narrow as SAC's nearly each is
 
 
 class GaussianAgent:
@@ -143,7 +144,14 @@ class AgentImitation:
         params: list[Any] = list(agent.actor.parameters())
         losses: list[float] = []
 
+        def read() -> Tensor:
+            return parameters_to_vector(params).detach()
+
+        def put(vector: Tensor) -> None:
+            vector_to_parameters(vector, params)
+
         def step() -> None:
+            start = read()
             some = torch.from_numpy(self._rng.integers(len(obs), size=self.cfg.imitation_batch))
             found = agent.gaussian(obs[some])
             std = found.stddev.detach()
@@ -152,18 +160,13 @@ class AgentImitation:
             self.optimiser.zero_grad()
             miss.backward()
             self.optimiser.step()
+            put(start + (read() - start))  # a whole step is rounded as a halved one
 
         @torch.no_grad()
         def kl() -> float:
             return kl_divergence(old, agent.gaussian(reference)).sum(dim=1).mean().item()
 
-        # For a policy as narrow as SAC's nearly every full step is too long.
         kl_there, _ = imitate_within(
-            max_kl,
-            self.cfg.imitation_steps,
-            lambda: parameters_to_vector(params).detach(),
-            lambda vector: vector_to_parameters(vector, params),
-            step,
-            kl,
+            max_kl, self.cfg.imitation_steps, read, put, step, kl, HALVINGS
         )
         return {"loss": losses[0], "kl": kl_there, "log_pi": log_pi}

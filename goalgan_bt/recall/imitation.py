@@ -18,8 +18,6 @@ from goalgan_bt.agent.trpo import line_search
 from goalgan_bt.recall.settings import ImitationConfig
 from goalgan_bt.runs import checkpoint, ranks
 
-HALVINGS = 10  # of a step that is too long, before it is given up
-
 
 def faded(max_kl: float, at: float, end: float | None) -> float:
     """A bound on the KL that falls on a line to zero at `end`, from there on nothing is imitated;
@@ -34,9 +32,10 @@ def imitate_within(
     put: Callable[[Tensor], None],
     step: Callable[[], None],
     kl: Callable[[], float],
+    halvings: int = 0,
 ) -> tuple[float, int]:
     """Take gradient steps while the policy stays within a bound on the KL from where it was. The
-    step that would leave it is shortened, by halves, until it stays, and is the last.
+    step that would leave it is undone, or halved until it stays, and no other follows.
 
     Args:
         max_kl: the bound, nats.
@@ -44,6 +43,7 @@ def imitate_within(
         read, put: give and set the parameters as a vector, (p,).
         step: takes a step of the optimiser.
         kl: from the policy as it was to the policy as it is, nats.
+        halvings: how often a step that is too long is halved before it is undone.
 
     Returns:
         The KL at the end, and the steps taken, a shortened one included.
@@ -57,16 +57,16 @@ def imitate_within(
     for taken in range(steps):
         start = read()
         step()
-        full_step = read() - start
-        found = None
-        if torch.isfinite(full_step).all():
-            found = line_search(evaluate, start, full_step, max_kl, HALVINGS + 1, 0.5)
+        if (here := kl()) <= max_kl:
+            reached = here
+            continue
+        half, found = (read() - start) / 2, None
+        if torch.isfinite(half).all():
+            found = line_search(evaluate, start, half, max_kl, halvings, 0.5)
         if found is None:
             put(start)
             return reached, taken
-        there, _, reached = found  # and in place: the last that was tried
-        if not torch.equal(there, start + full_step):
-            return reached, taken + 1
+        return found[2], taken + 1
     return reached, steps
 
 
@@ -86,7 +86,8 @@ class Imitation:
     def update(
         self, obs: Tensor, actions: Tensor, reference: Tensor, progress: float
     ) -> dict[str, float]:
-        """Take up to `cfg.steps` steps within the bound on the KL (see `imitate_within`).
+        """Take up to `cfg.steps` steps within the bound on the KL (see `imitate_within`); one that
+        would leave it is undone: halving it was no better (docs/LOG.md).
 
         Args:
             obs: (n, obs_dim) normalised observations of the traces; none is fine.

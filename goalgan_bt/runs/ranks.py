@@ -23,7 +23,7 @@ from goalgan_bt.runs.errors import InterruptedRun
 SILENCE = timedelta(minutes=5)  # a rank that says nothing for so long counts as dead
 
 # The value function learns in a thread of its own: what two threads send must not mix.
-_beside: "dist.ProcessGroup | None" = None
+_background: "dist.ProcessGroup | None" = None
 
 Array = TypeVar("Array", bound=np.ndarray)
 
@@ -34,21 +34,21 @@ def begin() -> None:
     Raises:
         InterruptedRun: if they cannot be reached.
     """
-    global _beside
+    global _background
     if not dist.is_torchelastic_launched() or dist.is_initialized():
         return
     with _clear_errors():
         dist.init_process_group("cpu:gloo", timeout=SILENCE)
-        _beside = dist.new_group(timeout=SILENCE)
+        _background = dist.new_group(timeout=SILENCE)
 
 
 def end() -> None:
     """Leave the other ranks. A process must do so before it ends: gloo's threads, which end with
     the last reference to their group, would else wake in a Python that is gone, and abort."""
-    global _beside
+    global _background
     if dist.is_initialized():
         dist.destroy_process_group()
-        _beside = None
+        _background = None
 
 
 def rank() -> int:
@@ -61,16 +61,16 @@ def size() -> int:
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
-def total(x: Tensor, beside: bool = False) -> Tensor:
+def total(x: Tensor, background: bool = False) -> Tensor:
     """The sum over all ranks of a tensor, which is changed in place.
 
     Args:
         x: of the same shape on every rank.
-        beside: whether it is the thread beside the main one that asks.
+        background: whether it is the thread in the background that asks.
     """
     if size() > 1:
         with _clear_errors():
-            dist.all_reduce(x, group=_beside if beside else None)
+            dist.all_reduce(x, group=_background if background else None)
     return x
 
 
