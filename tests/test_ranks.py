@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import run_module
+from conftest import call
 
 from goalgan_bt.learners import maze_config, maze_learner, table
 from goalgan_bt.learners.maze_config import make_env
@@ -47,8 +47,10 @@ def test_alone_nothing_is_reduced_or_shared():
 
 
 CHECK = """
-import os
+import os, sys
 import numpy as np, torch
+import goalgan_bt.learners.maze
+from goalgan_bt import train
 from goalgan_bt.runs import ranks
 threads = lambda: len(os.listdir("/proc/self/task"))
 torch.ones(1)
@@ -58,7 +60,7 @@ assert threads() > before
 r = ranks.rank()
 assert ranks.size() == 2
 assert ranks.total(torch.full((2,), r + 1.0)).tolist() == [3.0, 3.0]
-assert ranks.total(torch.tensor(float(r)), beside=True).item() == 1.0
+assert ranks.total(torch.tensor(float(r)), background=True).item() == 1.0
 assert ranks.mean(torch.tensor(float(r))).item() == 0.5
 assert ranks.gather(np.full((r + 1, 2), r)).tolist() == [[0, 0], [1, 1], [1, 1]]
 assert ranks.gather(np.zeros((0, 3), bool)).shape == (0, 3)
@@ -69,27 +71,30 @@ assert ranks.agreed(float(r)) == 0.5
 x = torch.full((3,), float(r))
 ranks.agree([x])
 assert x.tolist() == [0.0] * 3
-ranks.end()
+assert train.main(sys.argv[1:]) == 2  # refused; a command leaves the others as it ends
 assert ranks.size() == 1
 assert threads() == before  # one of gloo's that is left aborts the process now and then
 """
 
 
-def test_two_ranks_reduce_gather_and_share(tmp_path):
+def test_two_ranks_reduce_gather_share_and_must_divide_the_simulations(tmp_path):
     script = tmp_path / "check.py"
     script.write_text(CHECK)
-    process = start(program=[script])
+    uneven = *SMALL.split(), "--rollout.num-envs", 9, "--out", tmp_path
+    process = start(*uneven, program=[script])
     output, _ = process.communicate(timeout=120)
     assert process.returncode == 0, output
+    lines = [line for line in output.splitlines() if line.startswith("error:")]
+    assert lines == ["error: --rollout.num-envs must be a multiple of the 2 ranks, not 9"]
 
 
 def test_one_and_two_ranks_make_the_same_update(tmp_path):
     """The same seed and batch: parameters differ by rounding only."""
     steps = ("--iterations", 1, "--rollout.steps", 40)
-    code = run_module("train", *SMALL.split(), *steps, "--out", tmp_path / "one").returncode
     process = start(*SMALL.split(), *steps, "--out", tmp_path / "two")
+    alone = call("train", *SMALL.split(), *steps, "--out", tmp_path / "one")
     output, _ = process.communicate(timeout=120)
-    assert code == 0 and process.returncode == 0, output
+    assert alone.returncode == 0 and process.returncode == 0, output
     assert output.count("run folder") == 1 and output.count("it 1 ") == 1  # one rank speaks
     one, two = saved(tmp_path / "one"), saved(tmp_path / "two")
     assert one["run"]["steps"]["train"] == two["run"]["steps"]["train"] == 4 * 8 * 40 * 4
@@ -121,7 +126,7 @@ def test_a_rank_that_dies_ends_the_run_with_a_usable_checkpoint(tmp_path, victim
     deadline = time.monotonic() + 90
     while not list(tmp_path.glob("*/checkpoint.pt")):
         assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.2)
+        time.sleep(0.02)
     os.kill(pid_of(victim, tmp_path), signal.SIGKILL)
     output, _ = process.communicate(timeout=100)
     assert process.returncode != 0
@@ -134,7 +139,7 @@ def test_a_rank_that_dies_ends_the_run_with_a_usable_checkpoint(tmp_path, victim
     cfg = table.load(folder)
     learner = MazeLearner(make_env(cfg, 1), cfg)
     more = maze_learner.load(learner, folder)["steps"]["train"] + 3000
-    resumed = run_module("train", "--resume", folder, "--total-steps", more, "--viz", "none")
+    resumed = call("train", "--resume", folder, "--total-steps", more, "--viz", "none")
     assert resumed.returncode == 0, resumed.stderr
 
 
@@ -148,11 +153,3 @@ def pid_of(rank, out):
         if str(out).encode() in command and f"\0RANK={rank}\0".encode() in environment:
             return int(proc.name)
     raise AssertionError(f"no process of rank {rank}")
-
-
-def test_simulations_must_divide_among_the_ranks():
-    process = start(*SMALL.split(), "--rollout.num-envs", 9, "--iterations", 1)
-    output, _ = process.communicate(timeout=120)
-    assert process.returncode != 0
-    lines = [line for line in output.splitlines() if line.startswith("error:")]
-    assert lines == ["error: --rollout.num-envs must be a multiple of the 2 ranks, not 9"]
