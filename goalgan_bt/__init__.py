@@ -25,7 +25,7 @@ The backtracking model alone: what state and action may have led to a state, unr
 
 Recall traces for agents of Stable-Baselines3 are in `goalgan_bt.sb3`. What a call can be given that
 makes no sense is a `goalgan_bt.UsageError`, a folder that is no run a `goalgan_bt.RunError`; both
-are `ValueError`s, as is a file that cannot be loaded, and their message says what to do.
+are `ValueError`s, as is a damaged file, and their message says what to do.
 """
 
 import importlib

@@ -16,7 +16,7 @@ if __name__ == "__main__":
 
 import contextlib
 import importlib
-import os
+import inspect
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -26,9 +26,11 @@ from typing import Any
 from goalgan_bt.learners.run_config import RunConfig, Trained
 from goalgan_bt.learners.table import from_command_line, learner_of
 from goalgan_bt.runs.command_line import run_command
-from goalgan_bt.runs.run_folder import new_run
+from goalgan_bt.runs.errors import UsageError
+from goalgan_bt.runs.run_folder import ended, new_run
 from goalgan_bt.runs.signals import Stop
 from goalgan_bt.runs.terminal import complain, say
+from goalgan_bt.runs.torchrun import records
 from goalgan_bt.viz import page_process
 
 Begun = Callable[[Path], None]
@@ -36,7 +38,8 @@ NOTHING = "nothing new was saved, give the same command again"
 
 
 def train(env: str = "ant_umaze", *, viz: str = "none", **settings: Any) -> Trained:
-    """Train as the command does, and wait for the end of it.
+    """Train as the command does, and wait for the end of it. It seeds torch's own random numbers
+    and sets the number of its threads.
 
     Args:
         env: the environment.
@@ -54,36 +57,42 @@ def train(env: str = "ant_umaze", *, viz: str = "none", **settings: Any) -> Trai
         RunError: for a folder that is no run, or has nothing left to do.
         KeyboardInterrupt: for Ctrl-C, after a checkpoint.
     """
-    words = [] if "resume" in settings else ["--env", env]
+    if settings.get("resume", "") is None:  # as the default of somebody's own argument
+        del settings["resume"]
+    words = [] if "resume" in settings else ["--env", str(env)]
     for name, value in {"viz": viz, **settings}.items():
         flag = name.replace("_", "-")
+        if name in ("help", "h"):
+            raise UsageError(
+                "help() explains goalgan_bt.train; its settings are the command's flags"
+            )
         if isinstance(value, bool):
             *parts, last = flag.split(".")
             words.append("--" + ".".join([*parts, last if value else f"no-{last}"]))
         else:
-            values = value if isinstance(value, tuple | list) else (value,)
-            words += [f"--{flag}", *map(str, values)]
+            many = isinstance(value, tuple | list)
+            words += [f"--{flag}", *map(str, value)] if many else [f"--{flag}={value}"]
     cfg = from_command_line(words)
-    trained, stop = run(cfg, importlib.import_module(learner_of(cfg.env).module), lambda _: None)
+    module = importlib.import_module(learner_of(cfg.env).module)
+    stop = Stop()
+    trained = run(cfg, module, stop, lambda _: None)
     if stop.requested:
         raise KeyboardInterrupt
     return trained
 
 
-def run(cfg: RunConfig, module: Any, begun: Begun) -> tuple[Trained, Stop]:
+def run(cfg: RunConfig, module: Any, stop: Stop, begun: Begun) -> Trained:
     """Make the run folder, or take up the one to go on with, open the page and train.
 
     Args:
         cfg: settings.
         module: of their learner.
+        stop: asked now and then whether to end early.
         begun: told the folder as soon as there is one.
-
-    Returns:
-        What came of it, and whether somebody wanted it to stop.
     """
     with contextlib.ExitStack() as at_last, module.prepared(cfg) as world:
-        folder, page, stop = cfg.resume, None, Stop()
-        if os.environ.get("RANK", "0") == "0":  # of several processes the first records
+        folder, page = cfg.resume, None
+        if records():
             if cfg.viz == "browser" and learner_of(cfg.env).has_map:
                 page = page_process.PageProcess(cfg.viz_host, cfg.viz_port)
                 at_last.callback(page.close)
@@ -100,7 +109,7 @@ def run(cfg: RunConfig, module: Any, begun: Begun) -> tuple[Trained, Stop]:
             say(f"{trained.measure} {value:.3f} after {steps:,} training steps: {folder}")
             if page is not None:
                 page.ended_well = True
-        return trained, stop
+        return trained
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -115,10 +124,11 @@ def main(argv: list[str] | None = None) -> int:
         cfg = from_command_line(sys.argv[1:] if argv is None else argv)
         with nothing_to_lose(f"interrupted: {NOTHING}"):  # torch takes seconds to import
             module = importlib.import_module(learner_of(cfg.env).module)
-        _, stop = run(cfg, module, begun)
+        stop = Stop(goodbye=True)
+        run(cfg, module, stop, begun)
         if not stop.requested:
             return 0
-        if os.environ.get("RANK", "0") == "0":
+        if records():
             complain(f"stopped by {stop.name}: {how_to_go_on(folder)}")
         return stop.code
 
@@ -127,8 +137,10 @@ def main(argv: list[str] | None = None) -> int:
 
 def how_to_go_on(folder: Path | None) -> str:
     """The end of a message about a run that stopped early."""
-    if folder is None and os.environ.get("RANK", "0") != "0":
+    if folder is None and not records():
         return ""  # only the first rank knows
+    if folder is not None and ended(folder) == "complete":
+        return f"the run is complete: {folder}"
     if folder is None or not (folder / "checkpoint.pt").exists():
         return NOTHING
     return f"go on from the last checkpoint with --resume {folder}"
@@ -143,6 +155,7 @@ class _Command(ModuleType):
 
 
 sys.modules[__name__].__class__ = _Command
+sys.modules[__name__].__signature__ = inspect.signature(train)  # type: ignore[attr-defined]
 
 if __name__ == "__main__":
     exit_with(main())

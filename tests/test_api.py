@@ -1,6 +1,7 @@
 """What one can import: names, a run from Python, a policy to take away, the example."""
 
 import ast
+import inspect
 import os
 import pydoc
 import signal
@@ -26,6 +27,8 @@ def test_every_name_is_there_and_explained():
     for name in goalgan_bt.__all__:
         assert getattr(goalgan_bt, name).__doc__, name
     assert set(goalgan_bt.__all__) <= set(dir(goalgan_bt)) and goalgan_bt.__version__
+    assert "total_steps" in inspect.getdoc(goalgan_bt.train.train)
+    assert "env" in inspect.signature(goalgan_bt.train).parameters
     with pytest.raises(AttributeError, match="no attribute 'magic'"):
         goalgan_bt.magic  # noqa: B018
     manual = pydoc.render_doc(goalgan_bt, renderer=pydoc.plaintext)
@@ -66,6 +69,21 @@ def test_a_run_that_makes_no_sense_is_an_error(env, settings, words, capsys):
     with pytest.raises((UsageError, RunError), match=words):
         goalgan_bt.train(env, **settings)
     assert not capsys.readouterr().err
+
+
+def test_what_goes_wrong_leaves_the_process_as_it_was(tmp_path):
+    """Its signals, and the run folder: who catches the error may go on at once."""
+    trained = goalgan_bt.train("point_umaze", iterations=1, threads=1, out=tmp_path, **TINY)
+    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    (trained.folder / "frames").rename(trained.folder / "kept")
+    (trained.folder / "frames").write_text("in the way")
+    with pytest.raises(OSError) as caught:
+        goalgan_bt.train(resume=trained.folder, iterations=2)
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
+    (trained.folder / "frames").unlink()
+    (trained.folder / "kept").rename(trained.folder / "frames")
+    assert goalgan_bt.train(resume=trained.folder, iterations=2).steps > trained.steps
+    assert caught.value is not None  # as notebooks keep it, with all that it holds
 
 
 def test_ctrl_c_in_a_notebook_leaves_a_checkpoint(tmp_path):
@@ -159,7 +177,13 @@ def test_a_backtracking_model_of_ones_own_leads_back_to_where_one_came_from():
         (lambda m, x: m.fit(x, x, x), "actions must be 5 rows of 1 numbers"),
         (lambda m, x: m.fit(x, x[:, :1], x[:4]), "next_states must be 5 rows of 2 numbers"),
         (lambda m, x: m.fit(x[:0], x[:0, :1], x[:0]), "states must be 1 rows of 2 numbers"),
+        (lambda m, x: m.fit(x, x[:, :1], x * np.nan), "not finite: leave those out"),
+        (lambda m, x: m.fit(x, x[:, :1], x, steps=-1), "steps must be a whole number"),
         (lambda m, x: recall_traces(m, x[:, :1], 3), "seeds must be rows of 2 numbers"),
+        (lambda m, x: recall_traces(m, x, 3, x[:2]), "goals as many"),
+        (lambda m, x: recall_traces(m, x, 3, valid=lambda s: True), "one answer for each of 5"),
+        (lambda m, x: BacktrackingModel(0, 1), "state_dim must be a whole number from 1 on"),
+        (lambda m, x: BacktrackingModel(2, 1, cfg=BacktrackingConfig(hidden=(0,))), "hidden must"),
     ],
 )
 def test_arrays_that_do_not_fit_a_model_are_refused(call, words):

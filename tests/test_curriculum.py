@@ -79,13 +79,19 @@ def test_what_was_saved_goes_on_the_same(tmp_path, settings):
     assert np.array_equal(loaded.success(goals), curriculum.success(goals))
 
 
-@pytest.mark.parametrize("data", [b"", b"nonsense", None])
-def test_a_file_that_is_none_is_refused_in_one_line(tmp_path, data):
+@pytest.mark.parametrize("damage", ["empty", "nonsense", 3000, 50_000, "places", "weights"])
+def test_a_file_that_is_none_is_refused_in_one_line(tmp_path, damage):
     path = tmp_path / "goals.pt"
-    if data is None:
-        lived(1)[0].save(path)
-        data = path.read_bytes()[:3000]
-    path.write_bytes(data)
+    curriculum, _, _ = lived(2)
+    if damage == "places":
+        curriculum.visited.goals = np.zeros((3, 2))
+    elif damage == "weights":
+        curriculum.gan.generator.flat.data[0] = np.nan
+    curriculum.save(path)
+    if damage in ("empty", "nonsense"):
+        path.write_bytes(b"nonsense" if damage == "nonsense" else b"")
+    elif isinstance(damage, int):
+        path.write_bytes(path.read_bytes()[:damage])
     with pytest.raises(ValueError, match=r"cannot load .*goals\.pt") as error:
         GoalCurriculum.load(path)
     assert "\n" not in str(error.value)
@@ -93,10 +99,8 @@ def test_a_file_that_is_none_is_refused_in_one_line(tmp_path, data):
         GoalCurriculum.load(tmp_path / "none.pt")
 
 
-def oracle():
-    curriculum = GoalCurriculum(LOW, HIGH, goals=GoalsConfig(source="oracle"))
-    curriculum.begin(np.array([LOW]))
-    return curriculum
+def of(**settings):
+    return GoalCurriculum(LOW, HIGH, goals=GoalsConfig(**settings))
 
 
 def asked():
@@ -119,7 +123,13 @@ def asked():
         (lambda: asked().success(LOW), "rows of 3 numbers"),
         (lambda: asked().ask(-1), "0 or more, not -1"),
         (lambda: asked().ask(1.5), "not 1.5"),
-        (lambda: oracle().ask(1), "they need the world"),
+        (lambda: of(source="oracle").ask(1), "need to know the world"),
+        (lambda: of(r_min=0.9, r_max=0.1), "r_min must be less than r_max"),
+        (lambda: of(neighbours=2000), "neighbours must not be more than episodes"),
+        (lambda: GoalCurriculum(LOW, HIGH, seed=1.5), "seed must be a whole number"),
+        (lambda: GoalCurriculum(LOW, HIGH, every=0), "every must be a whole number from 1"),
+        (lambda: GoalCurriculum(LOW, HIGH, goals={"near": 1}), "must be a GoalsConfig"),
+        (lambda: GoalCurriculum([-1e308], [1e308]), "both finite"),
         (lambda: GoalCurriculum(HIGH, LOW), "low must be less than high"),
         (lambda: GoalCurriculum([0.0], [np.inf]), "both finite"),
         (lambda: GoalCurriculum([0.0], [1.0, 2.0]), "corners of a box"),

@@ -94,10 +94,7 @@ class Run:
 
     def ended(self) -> str | None:
         """How the run ended, or None while it goes on (or was killed without a word)."""
-        try:
-            return (self.folder / run_folder.ENDED).read_text()[:200].strip()
-        except (OSError, UnicodeDecodeError):
-            return None
+        return run_folder.ended(self.folder)
 
 
 def success(frame: Frame) -> tuple[FloatArray, bool]:

@@ -24,13 +24,14 @@ from goalgan_bt.agent.networks import first_weights
 from goalgan_bt.curriculum.alp_gmm import AlpGmm
 from goalgan_bt.curriculum.gan import GoalGAN
 from goalgan_bt.curriculum.goals import GoalMemory, SuccessEstimator, intermediate
-from goalgan_bt.curriculum.settings import GanConfig, GoalsConfig
+from goalgan_bt.curriculum.settings import GanConfig, GoalsConfig, conflicts
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.runs import checkpoint
 from goalgan_bt.runs.errors import UsageError
 from goalgan_bt.runs.ranges import faults
 
 SIDE = 10.0  # metres, of the papers' goal box, for which the default distances are made
+WORLDLY = ("feasible", "oracle")  # sources of goals that a curriculum alone does not have
 MANY = 3  # dimensions, beyond which places visited are too many to remember
 
 
@@ -82,9 +83,7 @@ class GoalCurriculum:
             near = 1.0 if dim <= MANY else math.inf
             goals = GoalsConfig(anywhere=0.1, near=near)
         self.cfg, self._gan_cfg, self._every = goals, gan or GanConfig(), every
-        for settings in (self.cfg, self._gan_cfg):
-            for name, problem in faults(settings):
-                raise UsageError(f"{name} {problem}")
+        _check(seed, every, self.cfg, self._gan_cfg)
         self._box = self._inward(self.low), self._inward(self.high)
         self.rng = rng or np.random.default_rng(seed)
         self._noise = noise or torch.Generator().manual_seed(seed)
@@ -104,10 +103,12 @@ class GoalCurriculum:
         skills stay. Until the GAN has heard of a place that can be reached they are uniform.
 
         Raises:
-            UsageError: for a number that is none.
+            UsageError: for a number that is none, or a source of goals that must know the world.
         """
         if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 0:
             raise UsageError(f"ask for a whole number of goals, 0 or more, not {n!r}")
+        if self.cfg.source in WORLDLY:
+            raise UsageError(f"{self.cfg.source!r} goals need to know the world: ask for 'gan'")
         self._asked = True
         if not self._begun:
             return self._outward(self.uniform(n))
@@ -202,7 +203,7 @@ class GoalCurriculum:
             ValueError: if it is damaged or of another version.
         """
         try:
-            state = torch.load(path, weights_only=True)
+            state = checkpoint.read(Path(path))
             made = state["made"]
             goals = None if made["goals"] is None else GoalsConfig(**made["goals"])
             gan = GanConfig(**made["gan"])
@@ -212,12 +213,27 @@ class GoalCurriculum:
             curriculum._noise.set_state(state["noise"])
             curriculum._asked, curriculum._begun = map(bool, state["flags"])
             curriculum._pending = [goals.numpy() for goals in state["pending"]]
+            curriculum._check_loaded()
         except OSError:
             raise
         except Exception as error:  # torch raises many kinds for a damaged file
             why = f"it is damaged or of another version ({checkpoint.reason(error)})"
             raise ValueError(f"cannot load {path}: {why}") from error
         return curriculum
+
+    def _check_loaded(self) -> None:
+        """Refuse what no curriculum of this box can hold.
+
+        Raises:
+            ValueError: saying what it is.
+        """
+        memories = self.replay.goals, self.visited.goals, self.estimator.goals, *self._pending
+        for goals in memories:
+            if goals.shape[1:] != self.low.shape or not np.isfinite(goals).all():
+                raise ValueError("goals that it remembers are none of its box")
+        for network in (self.gan.generator, self.gan.discriminator):
+            if not network.flat.isfinite().all():
+                raise ValueError("a weight is not finite")
 
     # What those are made of. Here goals are in the units of the settings.
 
@@ -234,13 +250,8 @@ class GoalCurriculum:
         """New goals, (n, goal_dim): the GAN's (or ALP-GMM's), and where the settings want it some
         from anywhere, lest a GAN that has closed in on mastered goals hears of no others.
 
-        Raises:
-            UsageError: for a source that must know the world (`goalgan_bt.curriculum.baselines`).
+        Those of a source that must know the world are `goalgan_bt.curriculum.baselines`'.
         """
-        if self.cfg.source in ("feasible", "oracle"):
-            raise UsageError(
-                f"a curriculum alone cannot propose {self.cfg.source!r} goals: they need the world"
-            )
         if self.alp_gmm is not None:
             return self.alp_gmm.sample(n)
         if self.cfg.source == "uniform":
@@ -341,6 +352,24 @@ class GoalCurriculum:
         return np.clip(self._centre + self._unit * goals, self.low, self.high)
 
 
+def _check(seed: int, every: int, goals: GoalsConfig, gan: GanConfig) -> None:
+    """Refuse what makes no sense.
+
+    Raises:
+        UsageError: naming it.
+    """
+    for name, number, least in (("seed", seed, 0), ("every", every, 1)):
+        if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < least:
+            raise UsageError(f"{name} must be a whole number from {least} on, not {number!r}")
+    for settings, kind in ((goals, GoalsConfig), (gan, GanConfig)):
+        if not isinstance(settings, kind):
+            raise UsageError(f"settings must be a {kind.__name__}, not {settings!r}")
+        for name, problem in faults(settings):
+            raise UsageError(f"{name} {problem}")
+    for name, problem in conflicts(goals):
+        raise UsageError(f"{name} {problem}")
+
+
 def _box(low: ArrayLike, high: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """The corners of a box as arrays.
 
@@ -351,6 +380,8 @@ def _box(low: ArrayLike, high: ArrayLike) -> tuple[FloatArray, FloatArray]:
     shapes = corners[0].shape, corners[1].shape
     if shapes[0] != shapes[1] or len(shapes[0]) != 1 or not shapes[0][0]:
         raise UsageError(f"low and high must be the corners of a box, not of shapes {shapes}")
-    if not (np.isfinite(corners).all() and (corners[0] < corners[1]).all()):
+    with np.errstate(over="ignore"):
+        finite = np.isfinite([*corners, corners[1] - corners[0]]).all()
+    if not (finite and (corners[0] < corners[1]).all()):
         raise UsageError("low must be less than high in every dimension, and both finite")
     return corners

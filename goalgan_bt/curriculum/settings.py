@@ -3,6 +3,8 @@
 Apart from the code that reads them, so that a command line answers before torch is imported.
 """
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -41,6 +43,16 @@ class GoalsConfig:
     """Recent training episodes from which success is estimated."""
     neighbours: Annotated[int, ABOVE_ZERO] = 10
     """Episodes with the nearest goals whose successes are counted."""
+
+
+def conflicts(cfg: GoalsConfig) -> Iterator[tuple[str, str]]:
+    """What does not go together: a setting and what is wrong with it."""
+    if cfg.neighbours > cfg.episodes:
+        yield "neighbours", "must not be more than episodes"
+    if cfg.r_min >= cfg.r_max:
+        yield "r_min", "must be less than r_max"
+    if cfg.source == "gan_fit_all" and cfg.near == math.inf:
+        yield "near", "must be finite for gan_fit_all, which needs to know the places visited"
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from goalgan_bt.runs.ranges import SHARE, between
 from goalgan_bt.runs.run_folder import write_atomically
 from goalgan_bt.runs.session import Limits, Schedule, Session
 from goalgan_bt.runs.signals import Stop
+from goalgan_bt.runs.torchrun import refuse_company
 
 NAME = re.compile(r"four_rooms_(\d{1,2})")
 FAINT = 0.01  # times that each possible action counts as seen, so that none is impossible
@@ -357,7 +358,10 @@ def train(cfg: FourRoomsConfig, folder: Path | None, stop: Stop | None = None) -
     success, visits = math.nan, visited
     limits, schedule = Limits(cfg.total_steps), Schedule(lambda steps: BETWEEN * steps)
     # TensorBoard would import torch, for longer than the run.
-    with Session(folder, asdict(cfg), limits, schedule, stop=stop, events=False) as run:
+    again = cfg.resume is not None
+    with Session(
+        folder, asdict(cfg), limits, schedule, stop=stop, events=False, again=again
+    ) as run:
         while run.goes_on():
             # Practice: actor-critic, a step on what happened.
             batch = walkers.walk(learner.probabilities(), cfg.steps, rng)
@@ -382,10 +386,10 @@ def train(cfg: FourRoomsConfig, folder: Path | None, stop: Stop | None = None) -
                 run.note("eval", {"coverage": success, "return": round(discounted, 6)})
                 run.note("eval", {"states": int((visits > 0).sum())})
                 run.report({"train/states": int((visited > 0).sum())})
-    if folder is not None:
-        grids = {"training": visited, "trained": visits}
-        pictures: dict[str, Any] = {name: rooms.picture(counts) for name, counts in grids.items()}
-        write_atomically(folder / "visits.npz", lambda file: np.savez(file, **pictures))
+        if folder is not None:
+            grids = {"training": visited, "trained": visits}
+            pictures: dict[str, Any] = {name: rooms.picture(n) for name, n in grids.items()}
+            write_atomically(folder / "visits.npz", lambda file: np.savez(file, **pictures))
     return Trained(folder, "coverage", success, run.steps["train"])
 
 
@@ -409,7 +413,12 @@ def improve(learner: ActorCritic, batch: Batch, cfg: FourRoomsConfig) -> None:
 
 @contextmanager
 def prepared(cfg: FourRoomsConfig) -> Iterator[World]:
-    """It needs nothing."""
+    """It needs nothing but to be alone.
+
+    Raises:
+        UsageError: for several processes.
+    """
+    refuse_company(cfg.env)
     yield World(cfg.env, None)
 
 

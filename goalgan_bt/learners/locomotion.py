@@ -23,6 +23,7 @@ from goalgan_bt.runs.ranges import between
 from goalgan_bt.runs.run_folder import end_run
 from goalgan_bt.runs.session import Limits, Schedule, Session
 from goalgan_bt.runs.signals import Stop
+from goalgan_bt.runs.torchrun import refuse_company
 
 TASKS = {
     "half_cheetah": "HalfCheetah-v5",
@@ -160,8 +161,9 @@ def prepared(cfg: LocomotionConfig) -> Iterator[World]:
     """See that the agents are there.
 
     Raises:
-        UsageError: if the extra `sb3` is missing.
+        UsageError: if the extra `sb3` is missing, or for several processes.
     """
+    refuse_company(cfg.env)
     needed()
     yield World(cfg.env, None)
 
@@ -196,8 +198,9 @@ def train(cfg: LocomotionConfig, folder: Path | None, stop: Stop | None = None) 
         fresh = np.random.SeedSequence((cfg.seed, state["iteration"])).generate_state(1)
         agent.set_random_seed(int(fresh[0]))  # or it would draw what it drew at first
         if agent.num_timesteps >= cfg.total_steps:  # cut off just before it could end
-            checkpoint_to_policy(agent, folder)
+            save_policy(agent, folder)
             end_run(folder, "complete")
+            (folder / "checkpoint.pt").unlink()
             return Trained(folder, "return", mean, agent.num_timesteps)
     with Session(
         folder,
@@ -222,7 +225,9 @@ def train(cfg: LocomotionConfig, folder: Path | None, stop: Stop | None = None) 
             learned = {"return": float(mean)} | state_dict(agent, recall)
             run.report({}, learned.copy)
         if run.complete and folder is not None:
-            checkpoint_to_policy(agent, folder)
+            save_policy(agent, folder)
+    if run.complete and folder is not None:
+        (folder / "checkpoint.pt").unlink(missing_ok=True)  # it holds all that SAC has seen
     return Trained(folder, "return", mean, run.steps["train"])
 
 
@@ -238,8 +243,8 @@ def measure(agent: Any, test_env: Any, cfg: LocomotionConfig) -> tuple[float, in
     return sum(returns) / len(returns), sum(lengths)
 
 
-def checkpoint_to_policy(agent: Any, folder: Path) -> None:
-    """Leave the policy of a run that is complete, and not all that SAC has seen."""
+def save_policy(agent: Any, folder: Path) -> None:
+    """Write the policy of a run that is complete, and what normalises its observations."""
     import torch
 
     from goalgan_bt.runs import checkpoint
@@ -249,7 +254,6 @@ def checkpoint_to_policy(agent: Any, folder: Path) -> None:
         seen = normalising.obs_rms
         learned |= {"mean": torch.from_numpy(seen.mean), "var": torch.from_numpy(seen.var)}
     checkpoint.save(learned, folder / "policy.pt")
-    (folder / "checkpoint.pt").unlink(missing_ok=True)
 
 
 def resume(agent: Any, recall: Any, folder: Path) -> tuple[dict[str, Any], float]:

@@ -14,14 +14,14 @@ from goalgan_bt.agent.settings import (
     TrpoConfig,
     ValueConfig,
 )
-from goalgan_bt.curriculum.settings import GanConfig, GoalsConfig
+from goalgan_bt.curriculum.settings import GanConfig, GoalsConfig, conflicts
 from goalgan_bt.envs.goal_env import GoalEnv
 from goalgan_bt.envs.maze import Maze
 from goalgan_bt.learners.methods import METHODS
 from goalgan_bt.learners.run_config import RunConfig
 from goalgan_bt.recall.settings import BacktrackingConfig, ImitationConfig, too_much
-from goalgan_bt.runs.errors import UsageError
-from goalgan_bt.runs.ranges import ABOVE_ZERO, NOT_NEGATIVE, SHARE, Range
+from goalgan_bt.runs.errors import RunError, UsageError
+from goalgan_bt.runs.ranges import ABOVE_ZERO, NOT_NEGATIVE, SHARE, Range, between
 from goalgan_bt.runs.run_folder import maze_of
 
 
@@ -49,7 +49,7 @@ class MazeConfig(RunConfig):
     """Text map that replaces the maze: '#' wall, '.' free, 'S' start."""
     dim: Annotated[int, Range("2 to 6", 2, 6)] = 2
     """Dimensions of point_nd, 2 to 6."""
-    horizon: Annotated[int | None, ABOVE_ZERO] = None
+    horizon: Annotated[int | None, between(1, 10**6)] = None
     """Steps of an episode; by default 200 (point) or 500 (ant), more in longer mazes."""
     integrator: Literal["implicitfast", "rk4"] = "implicitfast"
     """MuJoCo's integrator; rk4 is the original's and costs four times as much."""
@@ -57,7 +57,7 @@ class MazeConfig(RunConfig):
     """What simulates: MuJoCo on the CPU, or mujoco-warp, in single precision (extra `gpu`)."""
     device: str = "auto"
     """Where mujoco-warp runs: cpu, cuda, cuda:1, ...; auto is a GPU where there is one."""
-    action_repeat: Annotated[int, ABOVE_ZERO] = 1
+    action_repeat: Annotated[int, between(1, 1000)] = 1
     """Steps of 0.02 s for which the policy holds each action (the original: 1)."""
     threads: Annotated[int, NOT_NEGATIVE] = 0
     """Simulation threads of each process; 0 is one per core."""
@@ -162,10 +162,14 @@ def check(cfg: MazeConfig) -> None:
     most = 8 * len(os.sched_getaffinity(0))
     if cfg.threads > most:
         raise UsageError(f"--threads must be at most {most} on this machine, not {cfg.threads}")
+    if cfg.learning_threads > most:
+        raise UsageError(
+            f"--learning-threads must be at most {most} on this machine, not {cfg.learning_threads}"
+        )
     if cfg.policy.final_std is not None and cfg.policy.final_std < cfg.policy.min_std:
         raise UsageError("--policy.final-std must not be less than --policy.min-std")
-    if cfg.goals.neighbours > cfg.goals.episodes:
-        raise UsageError("--goals.neighbours must not be more than --goals.episodes")
+    for name, wrong in conflicts(cfg.goals):
+        raise UsageError(f"--goals.{name.replace('_', '-')} {wrong}")
     if cfg.backtracking.min_transitions > cfg.backtracking.buffer:
         raise UsageError(
             "--backtracking.min-transitions must not be more than --backtracking.buffer"
@@ -184,10 +188,6 @@ def check(cfg: MazeConfig) -> None:
         raise UsageError("--device is mujoco-warp's: it goes with --physics warp")
     if cfg.dim != 2 and cfg.env != "point_nd":
         raise UsageError(f"--dim goes with point_nd: {cfg.env} has two dimensions")
-    if cfg.goals.source == "gan_fit_all" and cfg.goals.near == math.inf:
-        raise UsageError("gan_fit_all needs to know the places visited: give a finite --goals.near")
-    if cfg.goals.r_min >= cfg.goals.r_max:
-        raise UsageError("--goals.r-min must be less than --goals.r-max")
 
 
 def make_env(cfg: MazeConfig, num_envs: int, maze: Maze | None = None) -> GoalEnv:
@@ -200,6 +200,10 @@ def make_env(cfg: MazeConfig, num_envs: int, maze: Maze | None = None) -> GoalEn
     """
     if maze is None and cfg.resume is not None:
         maze = maze_of(cfg.resume)
+        if maze is None and cfg.map is not None:
+            raise RunError(
+                f"{cfg.resume / 'meta.json'} holds no maze: the run cannot go on in its own"
+            )
     return envs.make(
         cfg.env,
         num_envs,

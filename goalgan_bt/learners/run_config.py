@@ -19,7 +19,7 @@ class RunConfig:
     seed: Annotated[int, NOT_NEGATIVE] = 0
     """Seed of everything random."""
     total_steps: Annotated[int | None, ABOVE_ZERO] = None
-    """Stop after this many environment steps of training."""
+    """Stop after this many environment steps of training; the batch that passes it is finished."""
     out: Path = Path("runs")
     """Folder of runs; this run gets a folder of its own in it."""
     resume: Path | None = None

@@ -416,7 +416,7 @@ class RecallTraces(BaseCallback):
             ValueError: if it is damaged, or made with another `RecallConfig.model`.
         """
         try:
-            state = torch.load(path, weights_only=True)
+            state = checkpoint.read(Path(path))
             callback = cls(cfg or RecallConfig(**state["cfg"]), seed)
             if (kind := state["cfg"]["model"]) != callback.cfg.model:
                 raise ValueError(f"its model is {kind}, not {callback.cfg.model}")

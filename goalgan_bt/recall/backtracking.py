@@ -20,6 +20,7 @@ from goalgan_bt.agent.networks import MLP, RELU, TANH, Linearised, first_weights
 from goalgan_bt.recall.settings import BacktrackingConfig
 from goalgan_bt.runs import checkpoint
 from goalgan_bt.runs.errors import UsageError
+from goalgan_bt.runs.ranges import faults
 
 Array = NDArray[np.floating]
 
@@ -101,6 +102,13 @@ class BacktrackingModel(nn.Module):
     ) -> None:
         super().__init__()
         self.cfg = cfg = cfg or BacktrackingConfig()
+        for name, size, least in (
+            ("state_dim", state_dim, 1), ("act_dim", act_dim, 1), ("goal_dim", goal_dim, 0)
+        ):  # fmt: skip
+            if not isinstance(size, int | np.integer) or size < least:
+                raise UsageError(f"{name} must be a whole number from {least} on, not {size!r}")
+        for name, problem in faults(cfg):
+            raise UsageError(f"{name} {problem}")
         told = state_dim + (goal_dim if cfg.conditioned else 0)
         with first_weights(seed if generator is None else None):
             self.action_net = MLP((told, *cfg.hidden, act_dim), TANH)
@@ -142,7 +150,7 @@ class BacktrackingModel(nn.Module):
             before those steps, held_out_action_nll and held_out_state_nll of the unseen rows.
 
         Raises:
-            UsageError: if the arrays do not fit each other or the model.
+            UsageError: if the arrays do not fit each other or the model, or are not finite.
         """
         rows, (state_dim, act_dim, goal_dim) = len(states), self.sizes
         data = states, actions, next_states, np.empty((rows, 0)) if goals is None else goals
@@ -162,8 +170,12 @@ class BacktrackingModel(nn.Module):
             metrics = {"held_out_action_nll": action_nll, "held_out_state_nll": state_nll}
 
         steps, size = self.cfg.steps if steps is None else steps, self.cfg.batch
+        if not isinstance(steps, int | np.integer) or steps < 0:
+            raise UsageError(f"steps must be a whole number from 0 on, not {steps!r}")
         drawn = torch.randint(rows, (max(1, steps) * size,), generator=self._rng).numpy()
         batch = _batch(data, drawn)
+        if not all(x.isfinite().all() for x in batch):
+            raise UsageError("a number in the transitions is not finite: leave those out")
         scales = self.state_scale, self.action_scale, self.delta_scale, self.goal_scale
         # Statistics of these rows alone: the whole buffer took longer than the steps.
         for scale, x in zip(scales, batch, strict=True):

@@ -74,12 +74,14 @@ def recall_traces(
     Raises:
         UsageError: if seeds or goals do not fit the model.
     """
+    seeds = np.asarray(seeds, dtype=float)
     n, (state_dim, act_dim, goal_dim) = len(seeds), model.sizes
-    goals = np.empty((n, 0)) if goals is None else goals
-    if np.shape(seeds) != (n, state_dim) or (model.cfg.conditioned and goals.shape[1] != goal_dim):
+    goals = np.empty((n, 0)) if goals is None else np.asarray(goals, dtype=float)
+    told = goal_dim if model.cfg.conditioned else goals.shape[-1]
+    if seeds.shape != (n, state_dim) or goals.shape != (n, told):
         raise UsageError(
-            f"seeds must be rows of {state_dim} numbers and goals of {goal_dim}, "
-            f"not arrays of shapes {np.shape(seeds)} and {goals.shape}"
+            f"seeds must be rows of {state_dim} numbers, and goals as many of {goal_dim}, "
+            f"not arrays of shapes {seeds.shape} and {goals.shape}"
         )
     valid = valid or _finite
     wanted = torch.from_numpy(goals).float()
@@ -91,10 +93,21 @@ def recall_traces(
         previous, action = model.predecessors(torch.from_numpy(current).float(), wanted)
         current = previous.double().numpy()
         current = current if repair is None else repair(current)
-        alive = alive & valid(current)
+        alive = alive & _told(valid(current), n)
         states[t], actions[t], alive_at[t] = current, action.numpy(), alive
         current = np.where(alive[:, None], current, seeds)  # a dead trace stays finite
     return Traces(states, actions, alive_at, goals, seeds)
+
+
+def _told(valid: BoolArray, n: int) -> BoolArray:
+    """What somebody's `valid` says, where that is one answer per state.
+
+    Raises:
+        UsageError: if it is not.
+    """
+    if np.shape(valid) != (n,):
+        raise UsageError(f"valid must give one answer for each of {n} states, not {valid!r}")
+    return np.asarray(valid, dtype=bool)
 
 
 def _finite(states: FloatArray) -> BoolArray:

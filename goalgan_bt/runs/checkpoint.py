@@ -1,5 +1,6 @@
 """Checkpoints: the whole training state in one file, written atomically, read without pickles."""
 
+import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,6 +31,20 @@ def restore(module: Any, state: dict[str, Any]) -> None:
     module.load_state_dict(state)
     for group, rate in zip(getattr(module, "param_groups", []), rates, strict=True):
         group["lr"] = rate
+
+
+def read(path: Path) -> Any:
+    """What `save` wrote.
+
+    Raises:
+        OSError: if the file cannot be opened.
+        ValueError: if it is damaged.
+    """
+    data = path.read_bytes()
+    try:
+        return torch.load(io.BytesIO(data), weights_only=True)
+    except Exception as error:  # torch raises many kinds for a damaged file
+        raise ValueError(reason(error)) from error
 
 
 @contextmanager

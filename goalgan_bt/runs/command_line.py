@@ -21,6 +21,7 @@ from goalgan_bt.runs.signals import SIGNALS
 from goalgan_bt.runs.terminal import complain
 
 T = TypeVar("T")
+NO_MEMORY = "out of memory: use smaller settings, for example fewer simulations or smaller networks"
 
 
 def parse(kind: type[T], argv: list[str] | None, prog: str, default: T | None = None) -> T:
@@ -69,12 +70,9 @@ def run_command(work: Callable[[], int | None], go_on: Callable[[], str] | None 
     Returns:
         The exit code: 0, 2 for what went wrong, 130 for Ctrl-C.
     """
-    asked = signal.SIGINT
 
     def stop(number: int, _: FrameType | None) -> None:
-        nonlocal asked
-        asked = signal.Signals(number)
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt(number)
 
     def told(problem: str) -> int:
         complain(f"{problem}: {go_on()}" if go_on is not None and go_on() else problem)
@@ -84,12 +82,16 @@ def run_command(work: Callable[[], int | None], go_on: Callable[[], str] | None 
         signal.signal(number, stop)
     try:
         return work() or 0
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stopped:
         if go_on is not None:
             told("interrupted")
-        return 130 if asked == signal.SIGINT else 2
+        return 2 if signal.SIGTERM in stopped.args else 130
     except MemoryError:
-        complain("out of memory: use smaller settings, for example fewer simulations")
+        complain(NO_MEMORY)
+    except RuntimeError as error:
+        if "can't allocate memory" not in str(error):  # torch has no kind of its own for it
+            raise
+        complain(NO_MEMORY)
     except BrokenPipeError:
         sys.stdout = sys.stderr  # nobody reads standard output any more
         return told("standard output was closed")

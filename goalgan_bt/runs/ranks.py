@@ -19,6 +19,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from goalgan_bt.runs.errors import InterruptedRun
+from goalgan_bt.runs.torchrun import launched
 
 SILENCE = timedelta(minutes=5)  # a rank that says nothing for so long counts as dead
 
@@ -35,7 +36,7 @@ def begin() -> None:
         InterruptedRun: if they cannot be reached.
     """
     global _background
-    if not dist.is_torchelastic_launched() or dist.is_initialized():
+    if not launched() or dist.is_initialized():
         return
     with _clear_errors():
         dist.init_process_group("cpu:gloo", timeout=SILENCE)

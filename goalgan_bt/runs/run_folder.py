@@ -173,6 +173,14 @@ def end_run(folder: Path, how: str) -> None:
     (folder / ENDED).write_text(how + "\n")
 
 
+def ended(folder: Path) -> str | None:
+    """How a run ended; None while it goes on, or where it was killed without a word."""
+    try:
+        return (folder / ENDED).read_text()[:200].strip()
+    except (OSError, UnicodeDecodeError):
+        return None
+
+
 def env_of(folder: Path) -> str:
     """The environment of a run; none, "", where that cannot be read: who reads all of its settings
     tells why."""

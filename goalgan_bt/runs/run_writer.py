@@ -21,21 +21,34 @@ class RunWriter:
         folder: the run folder.
         iteration: rows after this one are dropped, for a run that is taken up again.
         events: whether TensorBoard gets the metrics too, if it is installed.
+        resumed: whether the run goes on, or begins again, which `meta.json` then tells.
 
     Raises:
         RunError: if another process trains this run, or what it holds is damaged.
     """
 
-    def __init__(self, folder: Path, iteration: int = 0, events: bool = True) -> None:
+    def __init__(
+        self, folder: Path, iteration: int = 0, events: bool = True, resumed: bool = False
+    ) -> None:
         self.folder = folder
         self._lock = (folder / "lock").open("w")
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
+            self._lock.close()
             raise RunError(f"{folder} is being trained by another process: wait for it") from None
+        try:
+            self._take_up(iteration, events, resumed or iteration > 0)
+        except BaseException:
+            self._lock.close()
+            raise
+
+    def _take_up(self, iteration: int, events: bool, resumed: bool) -> None:
+        """Keep what the folder holds up to an iteration."""
+        folder = self.folder
         self._rows: list[dict[str, str]] = []
         self._columns: list[str] = []
-        if iteration:
+        if resumed:
             note_resumed(folder)
         (folder / "frames").mkdir(exist_ok=True)
         (folder / ENDED).unlink(missing_ok=True)

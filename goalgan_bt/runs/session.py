@@ -63,6 +63,7 @@ class Session:
         stop: asked at the end of every iteration whether to end early.
         agreed: makes a number the same on all ranks.
         events: whether TensorBoard gets the metrics too.
+        again: whether a run that was there begins once more.
 
     Attributes:
         iteration: the one under way, from 1 on.
@@ -88,6 +89,7 @@ class Session:
         stop: Stop | None = None,
         agreed: Callable[[float], float] = float,
         events: bool = True,
+        again: bool = False,
     ) -> None:
         self.folder, self._limits, self._schedule = folder, limits, schedule
         self._stop, self._agreed = stop, agreed
@@ -109,7 +111,7 @@ class Session:
         self._reached, self._last, self._measures = 0.0, False, False
         self._writer = None
         if folder is not None:
-            self._writer = RunWriter(folder, self.iteration, events)
+            self._writer = RunWriter(folder, self.iteration, events, again)
             write_settings(folder, dict(settings))
         self._terminal = None if title is None else Terminal(title)
         self.background = Background()
@@ -233,7 +235,9 @@ class Session:
             self._terminal.close()
         if self._writer is None:
             return
-        how = "complete" if self.complete else "stopped early: --resume goes on"
+        saved = self.folder is not None and (self.folder / "checkpoint.pt").exists()
+        early = "stopped early: --resume goes on" if saved else "stopped early"
+        how = "complete" if self.complete else early
         self._writer.close(how if error is None else None)
         if self.folder is not None and isinstance(error, OSError) and not self.folder.exists():
             raise RunError(f"the run folder {self.folder} has vanished: start again") from None

@@ -48,12 +48,17 @@ def nothing_to_lose(words: str) -> Iterator[None]:
 class Stop:
     """Turns Ctrl-C and `kill` into a wish that the loop grants after its iteration.
 
-    A second Ctrl-C ends at once. Installs its handlers on entry and puts the old ones back; in
+    A second signal ends at once. Installs its handlers on entry and puts the old ones back; in
     another thread than the main one, where Python allows none, it does nothing.
+
+    Args:
+        goodbye: for a process that after an error has only its last words left, which a launcher's
+            `kill` shall not cut off: it is then ignored.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, goodbye: bool = False) -> None:
         self.signal: int | None = None
+        self._goodbye = goodbye
 
     @property
     def requested(self) -> bool:
@@ -77,13 +82,12 @@ class Stop:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         for number, handler in self._old.items():
-            # After an error only the goodbye is left, which a launcher's `kill` shall not cut off.
-            last_words = kind is not None and number == signal.SIGTERM
+            last_words = self._goodbye and kind is not None and number == signal.SIGTERM
             signal.signal(number, signal.SIG_IGN if last_words else handler)
 
     def _note(self, number: int, _: FrameType | None) -> None:
-        if self.requested and number == signal.SIGINT:
-            raise KeyboardInterrupt
+        if self.requested:
+            raise KeyboardInterrupt(number)
         self.signal = number
 
 

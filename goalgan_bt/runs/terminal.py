@@ -1,13 +1,14 @@
 """What a person sees while it trains: one live table, or one plain line per report."""
 
 import contextlib
-import os
 import sys
 import time
 
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
+
+from goalgan_bt.runs.torchrun import speaks
 
 ROWS = (  # label, column of metrics.csv, format, unit
     ("iteration", "iteration", "{:,.0f}", ""),
@@ -89,7 +90,7 @@ def say(text: str) -> None:
 def complain(text: str) -> None:
     """One line on standard error, if anybody listens there. Of several processes on a machine that
     torchrun started, the first speaks."""
-    if os.environ.get("LOCAL_RANK", "0") != "0" and not text.startswith("rank "):
+    if not speaks() and not text.startswith("rank "):
         return
     with contextlib.suppress(OSError):
         print(f"error: {text}", file=sys.stderr, flush=True)
