@@ -1,8 +1,13 @@
-"""What several test files share: commands in processes of their own, and a tiny finished run."""
+"""What several test files share: commands, here or in processes of their own, and a tiny run."""
 
+import contextlib
+import importlib
+import io
 import shutil
+import signal
 import subprocess
 import sys
+import warnings
 
 import pytest
 import torch
@@ -11,6 +16,7 @@ from goalgan_bt.envs import maze as mazes
 from goalgan_bt.learners import table
 from goalgan_bt.learners.maze import train
 from goalgan_bt.runs import run_folder
+from goalgan_bt.runs.signals import SIGNALS
 
 # Many small networks: threads would only wait for each other.
 torch.set_num_threads(1)
@@ -26,6 +32,52 @@ def run_module(name, *arguments):
     """`python -m goalgan_bt.<name>` until it ends: its exit code, what it printed."""
     words = [sys.executable, "-m", f"goalgan_bt.{name}", *map(str, arguments)]
     return subprocess.run(words, capture_output=True, text=True, timeout=120)
+
+
+@contextlib.contextmanager
+def started(name, *arguments, **how):
+    """The same while it goes on; it does not outlive the test."""
+    words = [sys.executable, "-m", f"goalgan_bt.{name}", *map(str, arguments)]
+    process = subprocess.Popen(words, text=True, **how)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait(timeout=20)
+        for pipe in filter(None, (process.stdin, process.stdout, process.stderr)):
+            pipe.close()
+
+
+def call(name, *arguments):
+    """The same without a process, and so without the seconds of its imports: for all but what
+    happens to the process itself. Signal handlers are put back; a warning counts as printed."""
+    module = importlib.import_module(f"goalgan_bt.{name}")
+    if hasattr(module, "__path__"):
+        module = importlib.import_module(f"goalgan_bt.{name}.__main__")
+    words, printed, complaints = [*map(str, arguments)], io.StringIO(), io.StringIO()
+    handlers = {number: signal.getsignal(number) for number in SIGNALS}
+    try:
+        with (
+            contextlib.redirect_stdout(printed),
+            contextlib.redirect_stderr(complaints),
+            warnings.catch_warnings(record=True) as warned,
+        ):
+            as_in_a_process()
+            code = module.main(words)
+    except SystemExit as stop:  # --help
+        code = stop.code or 0
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    complaints.writelines(f"{warning.category.__name__}: {warning.message}\n" for warning in warned)
+    return subprocess.CompletedProcess(words, code, printed.getvalue(), complaints.getvalue())
+
+
+def as_in_a_process():
+    """Warn of what Python warns of, where pytest would have it otherwise."""
+    warnings.resetwarnings()
+    for quiet in (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning):
+        warnings.simplefilter("ignore", quiet)
 
 
 def serve(folder):

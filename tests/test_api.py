@@ -87,13 +87,14 @@ def test_what_goes_wrong_leaves_the_process_as_it_was(tmp_path):
 
 
 def test_ctrl_c_in_a_notebook_leaves_a_checkpoint(tmp_path):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     timer = threading.Timer(3.0, lambda: os.kill(os.getpid(), signal.SIGINT))
     timer.start()
     with pytest.raises(KeyboardInterrupt):
         goalgan_bt.train("point_umaze", threads=1, out=tmp_path, **TINY)
     (folder,) = tmp_path.iterdir()
     assert (folder / "checkpoint.pt").exists()
-    assert signal.getsignal(signal.SIGINT) == signal.default_int_handler
+    assert signal.signal(signal.SIGINT, before) == signal.default_int_handler
 
 
 def test_a_thread_that_is_not_the_main_one_may_train(tmp_path):

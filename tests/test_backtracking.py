@@ -50,8 +50,14 @@ def linear_walk(n=20_000, seed=0):
     return states, actions, states + 0.5 * actions + noise
 
 
-def test_it_recovers_the_reverse_of_a_linear_gaussian_walk():
-    model, _ = fitted(*linear_walk())
+@pytest.fixture(scope="module")
+def walked():
+    """A model of that walk, and what its last training told."""
+    return fitted(*linear_walk())
+
+
+def test_it_recovers_the_reverse_of_a_linear_gaussian_walk(walked):
+    model, _ = walked
     torch.manual_seed(1)
     following = torch.tensor([[1.0, -0.5]]).repeat(4000, 1)
     before, actions = model.predecessors(following, torch.zeros(4000, 2))
@@ -65,9 +71,8 @@ def test_it_recovers_the_reverse_of_a_linear_gaussian_walk():
     assert actions.mean(dim=0).numpy() == pytest.approx(expected, abs=0.08)
 
 
-def test_likelihood_improves_and_is_a_gaussians():
-    short = fitted(*linear_walk(), steps=5)[1]
-    long = fitted(*linear_walk(), steps=1500)[1]
+def test_likelihood_improves_and_is_a_gaussians(walked):
+    short, long = fitted(*linear_walk(), steps=5)[1], walked[1]
     assert long["state_nll"] < short["state_nll"] - 0.3
     # The action's variance is fixed to 1 in normalised units: the floor is 0.5 log(2 pi).
     assert long["action_nll"] > 0.5 * np.log(2 * np.pi)

@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from conftest import call
 
-from goalgan_bt import plot, train
 from goalgan_bt.learners import table
 from goalgan_bt.learners.maze_config import MazeConfig
 from goalgan_bt.study import plan
@@ -65,8 +65,7 @@ def test_every_documented_training_runs(words, tmp_path, folder, monkeypatch):
     (tmp_path / "my_maze.txt").write_text("#####\n#...#\n###.#\n#S..#\n#####\n")
     argv = filled(words, folder)
     if "--help" in argv:
-        with pytest.raises(SystemExit):
-            train.main(argv)
+        assert call("train", *argv).returncode == 0
         return
     cfg = table.from_command_line(argv)
     if "warp" in argv or not isinstance(cfg, MazeConfig | table.four_rooms.FourRoomsConfig):
@@ -75,7 +74,8 @@ def test_every_documented_training_runs(words, tmp_path, folder, monkeypatch):
     small = ["--total-steps", "500"] if "four_rooms" in words else shlex.split(SMALL)
     if "--resume" in argv:
         small = ["--iterations", "5"]
-    assert train.main([*argv, *small, "--viz", "none"]) == 0
+    done = call("train", *argv, *small, "--viz", "none")
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("words", of("study"))
@@ -89,7 +89,7 @@ def test_every_documented_study_is_there(words):
 def test_every_documented_plot_is_drawn(words, folder, tmp_path):
     pytest.importorskip("matplotlib")
     out = tmp_path / "x.png"
-    assert plot.main([*filled(words, folder), "--out", str(out)]) == 0 and out.exists()
+    assert call("plot", *filled(words, folder), "--out", out).returncode == 0 and out.exists()
 
 
 @pytest.mark.parametrize("words", [w for w in of("viz") if w])
@@ -98,7 +98,7 @@ def test_every_documented_page_is_understood(words, folder, tmp_path, monkeypatc
     cfg = viz.from_command_line(filled(words, folder))
     assert cfg.runs[0] == folder
     if cfg.export is not None:
-        assert viz.main(filled(words, folder)) == 0 and cfg.export.exists()
+        assert call("viz", *filled(words, folder)).returncode == 0 and cfg.export.exists()
 
 
 def test_every_command_is_run_or_listed_with_its_last_result():

@@ -6,7 +6,7 @@ import shutil
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from conftest import run_module
+from conftest import call, run_module
 
 from goalgan_bt.runs import run_folder
 from goalgan_bt.viz.export import export
@@ -64,7 +64,7 @@ def test_a_run_without_a_policy_is_exported_without_its_episodes(folder, tmp_pat
 @pytest.mark.parametrize("kind", ["gif", "mp4"])
 def test_a_movie_shows_every_report_and_holds_the_last(folder, tmp_path, kind):
     out = tmp_path / f"map.{kind}"
-    done = run_module("viz", folder, "--movie", out)
+    done = call("viz", folder, "--movie", out)
     assert done.returncode == 0, done.stderr
     pictures = iio.imread(out).astype(int)
     assert pictures.shape[0] >= 4 and pictures.shape[3] == 3
@@ -85,7 +85,7 @@ def test_a_movie_shows_every_report_and_holds_the_last(folder, tmp_path, kind):
     ],
 )
 def test_what_cannot_be_written_is_one_line(folder, tmp_path, flags, message):
-    done = run_module("viz", folder, flags[0], tmp_path / flags[1])
+    done = call("viz", folder, flags[0], tmp_path / flags[1])
     assert done.returncode == 2 and message in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
     assert not list(tmp_path.glob("map*")) and not list(tmp_path.glob("*.part"))
@@ -94,9 +94,9 @@ def test_what_cannot_be_written_is_one_line(folder, tmp_path, flags, message):
 def test_a_run_without_a_report_or_a_maze_is_refused(folder, tmp_path):
     shutil.rmtree(folder / "frames")
     for flags in (["--export", "run.html"], ["--movie", "map.gif"]):
-        done = run_module("viz", folder, flags[0], tmp_path / flags[1])
+        done = call("viz", folder, flags[0], tmp_path / flags[1])
         assert done.returncode == 2 and "holds no report yet" in done.stderr
-    done = run_module("viz", folder, folder, "--export", tmp_path / "run.html")
+    done = call("viz", folder, folder, "--export", tmp_path / "run.html")
     assert done.returncode == 2 and "name only one" in done.stderr
 
 
@@ -104,5 +104,5 @@ def test_a_run_without_walls_is_exported_too(folder, tmp_path):
     run_folder.write_meta(folder, None)
     export(Run(folder), tmp_path / "run.html")
     assert len(island(tmp_path / "run.html")["reports"]) == 8
-    done = run_module("viz", folder, "--movie", tmp_path / "map.gif")
+    done = call("viz", folder, "--movie", tmp_path / "map.gif")
     assert done.returncode == 2 and "no maze to draw" in done.stderr

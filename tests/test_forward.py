@@ -11,7 +11,7 @@ from goalgan_bt.recall.forward import ForwardModel, imagine
 from goalgan_bt.recall.settings import BacktrackingConfig
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in (1, 2))])
 def test_it_recovers_a_linear_system(seed):
     """Its mean everywhere (at one point the fit of a small network wanders), and its noise."""
     torch.manual_seed(seed)

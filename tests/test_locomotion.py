@@ -10,9 +10,8 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 import torch
-from conftest import run_module
+from conftest import call, started
 
-from goalgan_bt import train
 from goalgan_bt.learners import locomotion, table
 from goalgan_bt.runs import checkpoint, run_folder
 from goalgan_bt.runs.errors import RunError, UsageError
@@ -40,11 +39,11 @@ def test_presets_are_the_papers():
         table.from_command_line(["--env", "ant", "--method", "a2c"])
 
 
-@pytest.mark.parametrize(("method", "steps"), [("trpo", 5000), ("sac", 400)])
+@pytest.mark.parametrize(("method", "steps"), [("trpo", 5000), ("sac", 300)])
 def test_a_run_of_the_hopper(method, steps, tmp_path):
     pytest.importorskip("sb3_contrib")
     flags = "--env", "hopper", "--method", method, "--total-steps", steps, "--out", tmp_path
-    done = run_module("train", *flags, *SHORT)
+    done = call("train", *flags, *SHORT)
     assert done.returncode == 0, done.stderr
     (folder,) = tmp_path.iterdir()
     with (folder / "metrics.csv").open() as file:
@@ -59,9 +58,9 @@ def test_a_run_of_the_hopper(method, steps, tmp_path):
     assert any(name.startswith(("actor", "action_net")) for name in weights)
     if method == "sac":
         return  # the same from here on
-    drawn = run_module("plot", folder)
+    drawn = call("plot", folder)
     assert drawn.returncode == 0 and (folder / "curves.png").stat().st_size > 10_000
-    watched = run_module("viz", folder)
+    watched = call("viz", folder)
     assert watched.returncode == 2 and "hopper has no map" in watched.stderr
 
 
@@ -69,13 +68,12 @@ def test_a_run_of_the_hopper(method, steps, tmp_path):
 def test_a_run_that_is_stopped_goes_on(method, tmp_path):
     """From its last measurement, to the same number of steps, with all that it had learned."""
     pytest.importorskip("sb3_contrib")
-    steps = {"trpo": 3 * 4096, "sac": 800}[method]
+    steps = {"trpo": 2 * 4096, "sac": 400}[method]
     flags = "--env", "hopper", "--method", method, "--total-steps", steps, "--out", tmp_path
-    words = [sys.executable, "-m", "goalgan_bt.train", *map(str, flags + SHORT)]
-    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as running:
+    with started("train", *flags, *SHORT, stderr=subprocess.PIPE) as running:
         while not list(tmp_path.glob("*/checkpoint.pt")):
             assert running.poll() is None
-            time.sleep(0.05)
+            time.sleep(0.02)
         running.send_signal(signal.SIGTERM)
         _, said = running.communicate(timeout=20)
     (folder,) = tmp_path.iterdir()
@@ -86,18 +84,18 @@ def test_a_run_that_is_stopped_goes_on(method, tmp_path):
     if method == "sac":
         assert len(saved["replay"]["rewards"]) == saved["steps"]
 
-    refused = run_module("train", "--resume", folder, "--hidden", 8)
-    assert refused.returncode == 2 and "--resume takes no other flag" in refused.stderr
-    done = run_module("train", "--resume", folder)
+    refused = call("train", "--resume", folder, "--hidden", 8)
+    assert refused.returncode == 2 and "--hidden of a run cannot change" in refused.stderr
+    done = call("train", "--resume", folder)
     assert done.returncode == 0, done.stderr
     with (folder / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [int(row["iteration"]) for row in rows] == list(range(1, len(rows) + 1))
     counts = [int(row["steps/train"]) for row in rows]
-    assert counts[saved["done"][0] - 1] == saved["steps"] and counts == sorted(set(counts))
+    assert counts[saved["run"]["iteration"] - 1] == saved["steps"] and counts == sorted(set(counts))
     assert counts[-1] >= steps and (folder / "policy.pt").exists()
     assert not (folder / "checkpoint.pt").exists()
-    again = run_module("train", "--resume", folder)
+    again = call("train", "--resume", folder)
     assert again.returncode == 2 and "has reached its limits" in again.stderr
 
 
@@ -112,7 +110,7 @@ def test_what_is_restored_is_what_was_saved(method, tmp_path):
         agent, _ = locomotion.make(replace(locomotion.preset("hopper", method), seed=seed))
         agents.append((agent, sb3.RecallTraces(cfg, seed)))
     (agent, recall), (other, another) = agents
-    agent.learn(1000, callback=recall)
+    agent.learn(400, callback=recall)  # with TRPO a whole batch
     file = tmp_path / "state.pt"
     torch.save(locomotion.state_dict(agent, recall), file)
     locomotion.restore(other, another, torch.load(file, weights_only=True))
@@ -201,18 +199,17 @@ def test_a_checkpoint_that_says_nonsense_is_refused(change, tmp_path):
 
 
 @pytest.mark.parametrize("package", ["stable_baselines3", "sb3_contrib"])
-def test_without_the_agents_there_is_no_run_folder(package, tmp_path, monkeypatch, capsys):
+def test_without_the_agents_there_is_no_run_folder(package, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
-    flags = "--env", "hopper", "--out", str(tmp_path / "runs")
-    assert train.main(list(flags)) == 2 and not (tmp_path / "runs").exists()
-    said = capsys.readouterr().err
-    assert said == f'error: locomotion needs {package}: pip install "goalgan_bt[sb3]"\n'
+    done = call("train", "--env", "hopper", "--out", tmp_path / "runs")
+    assert done.returncode == 2 and not (tmp_path / "runs").exists()
+    assert done.stderr == f'error: locomotion needs {package}: pip install "goalgan_bt[sb3]"\n'
 
 
 def test_without_traces_nothing_is_recalled(tmp_path):
     pytest.importorskip("sb3_contrib")
-    flags = "--env", "hopper", "--total-steps", 4000, "--out", tmp_path
-    done = run_module("train", *flags, "--backtracking.trace-length", 0, *SHORT)
+    flags = "--env", "hopper", "--method", "sac", "--total-steps", 120, "--out", tmp_path
+    done = call("train", *flags, "--backtracking.trace-length", 0, *SHORT)
     assert done.returncode == 0, done.stderr
     (folder,) = tmp_path.iterdir()
     assert "recall/" not in (folder / "metrics.csv").read_text()
@@ -228,23 +225,20 @@ def test_without_traces_nothing_is_recalled(tmp_path):
     ],
 )
 def test_bad_flags_end_in_one_line(flags, words, tmp_path):
-    done = run_module("train", "--env", "hopper", "--out", tmp_path, *flags)
+    done = call("train", "--env", "hopper", "--out", tmp_path, *flags)
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and words in done.stderr
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_after_the_last_line_changes_nothing(number, tmp_path):
-    flags = ["--env", "hopper", "--method", "trpo", "--total-steps", "100"]
-    with subprocess.Popen(
-        [sys.executable, "-m", "goalgan_bt.train", *flags, "--out", tmp_path],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as running:
+def test_a_signal_after_the_last_line_changes_nothing(tmp_path):
+    pytest.importorskip("sb3_contrib")
+    flags = "--env", "hopper", "--method", "sac", "--total-steps", 20, "--episodes", 1
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with started("train", *flags, "--out", tmp_path, **pipes) as running:
         while " training steps: " not in running.stdout.readline():
             assert running.poll() is None
         time.sleep(0.05)
-        running.send_signal(number)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            running.send_signal(number)
         _, errors = running.communicate(timeout=60)
     assert running.returncode == 0 and not errors

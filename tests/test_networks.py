@@ -1,7 +1,5 @@
 """The written-out derivatives against torch's."""
 
-import math
-
 import pytest
 import torch
 from torch import nn
@@ -74,4 +72,4 @@ def test_a_network_of_one_layer_learns_a_line():
         net.flat.grad = at.vjp((at.output - (2 * x - 1)) / len(x))
         optimiser.step()
     assert net.flat.tolist() == pytest.approx([2.0, -1.0], abs=1e-2)
-    assert math.isfinite(float(net(x).sum()))
+    assert torch.allclose(net(x), 2 * x - 1, atol=0.03)

@@ -1,17 +1,18 @@
 """The page in a real browser: Debian's Chromium, headless, software rendering."""
 
+import contextlib
 import io
 import re
 import shutil
-import signal
 import subprocess
-import sys
+import time
 
 import numpy as np
 import pytest
-from conftest import serve
+from conftest import call, serve, started
 from PIL import Image
 
+from goalgan_bt.runs.frames import frame_paths
 from goalgan_bt.viz.export import export
 from goalgan_bt.viz.run import Run
 
@@ -36,23 +37,21 @@ def browser():
         browser.close()
 
 
-def train(*flags, out):
+@contextlib.contextmanager
+def training(*flags, out):
     """Training in the background, and its run folder."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "goalgan_bt.train", *TRAIN.split(), *flags],
-        cwd=out,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-    return process, out / process.stdout.readline().removeprefix("run folder: ").strip()
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    with started("train", *TRAIN.split(), *flags, cwd=out, **pipes) as process:
+        yield out / process.stdout.readline().removeprefix("run folder: ").strip()
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A finished run."""
-    process, folder = train("--total-steps", "300000", out=tmp_path_factory.mktemp("page"))
-    process.communicate(timeout=120)
+    out = tmp_path_factory.mktemp("page")
+    words = *TRAIN.split(), "--total-steps", 200_000, "--out", out
+    assert call("train", *words).returncode == 0
+    (folder,) = out.iterdir()
     return folder
 
 
@@ -66,14 +65,30 @@ def opened(browser, address):
     return page
 
 
-@pytest.fixture
-def page(browser, folder):
+@pytest.fixture(scope="module")
+def served(browser, folder):
+    """A page over the finished run."""
     process, address = serve(folder)
     page = opened(browser, address)
     yield page
     page.close()
     process.stdin.close()
     process.wait(timeout=20)
+
+
+@pytest.fixture
+def page(served, folder):
+    """The same as it was at first, whatever was done to it."""
+    served.get_by_role("tab", name="Time").click()
+    for name in ("Follow live", "Coverage map"):
+        served.get_by_label(name).set_checked(True)
+    served.get_by_text(last(folder)).wait_for()
+    return served
+
+
+def last(folder):
+    """How the caption of the last report begins."""
+    return re.compile(f"^Iteration {int(frame_paths(folder)[-1].stem):,} ")
 
 
 def layer(page, name):
@@ -95,18 +110,17 @@ def mastered(page):
 
 def colourful(page):
     """The share of the scene, as it is drawn, that is no shade of grey."""
-    page.wait_for_timeout(500)
+    page.wait_for_timeout(200)
     scene = {"x": 0, "y": 150, "width": 560, "height": 450}  # without panel and notices
     image = Image.open(io.BytesIO(page.screenshot(clip=scene, timeout=60_000))).convert("RGB")
     return float((np.ptp(np.asarray(image).astype(int), axis=2) > 50).mean())
 
 
 def happens(page, condition, seconds):
-    for _ in range(2 * seconds):
-        if condition():
-            return True
-        page.wait_for_timeout(500)
-    return False
+    end = time.monotonic() + seconds
+    while not (there := condition()) and time.monotonic() < end:
+        page.wait_for_timeout(100)
+    return bool(there)
 
 
 def wait_for(page, condition, seconds=90):
@@ -139,7 +153,7 @@ def test_layers_go_and_come_and_are_drawn(page):
     wait_for(page, lambda: colourful(page) > 0.8 * whole)
 
 
-def test_a_click_on_the_floor_is_tried(page):
+def test_a_click_on_the_floor_is_tried(page, folder):
     page.get_by_role("tab", name="Try").click()
     page.get_by_text("No goal set yet").wait_for()
     outcome = page.get_by_text("Policy of iteration")
@@ -148,7 +162,11 @@ def test_a_click_on_the_floor_is_tried(page):
         if happens(page, outcome.count, seconds=20):
             break
     wait_for(page, lambda: "after" in outcome.inner_text())
-    assert any(word in outcome.inner_text() for word in ("reached", "fell"))
+    told = re.search(
+        r"Goal \((-?\d\.\d), (-?\d\.\d)\): (not reached|reached|fell) after \d\.\d s",
+        outcome.inner_text(),
+    )
+    assert told and Run(folder).maze.is_free(np.array([[float(told[1]), float(told[2])]])).all()
 
 
 def test_an_exported_page_plays_without_a_network(browser, folder, tmp_path):
@@ -171,23 +189,15 @@ def test_an_exported_page_plays_without_a_network(browser, folder, tmp_path):
 
 
 def test_it_shows_learning_and_outlives_the_trainer(browser, tmp_path):
-    process, folder = train("--total-steps", "100000000", out=tmp_path)
-    while not list((folder / "frames").glob("*.npz")):
-        assert process.poll() is None
-        signal.sigtimedwait([], 0.2)
-    viewer, address = serve(folder)
-    page = opened(browser, address)
-    first = mastered(page)
-    wait_for(page, lambda: mastered(page) > first + 0.1, seconds=90)
-
-    process.kill()
-    process.wait(timeout=20)
-    page.wait_for_timeout(2000)
+    with training("--total-steps", "100000000", out=tmp_path) as folder:
+        viewer, address = serve(folder)
+        page = opened(browser, address)
+        first = mastered(page)
+        wait_for(page, lambda: mastered(page) > first + 0.1, seconds=90)
+    page.get_by_text(last(folder)).wait_for()  # the trainer was killed
     seen = page.get_by_text(CAPTION).inner_text()
-    resumed, _ = train("--resume", str(folder), out=tmp_path)
-    wait_for(page, lambda: page.get_by_text(CAPTION).inner_text() != seen)
-    resumed.kill()
-    resumed.wait(timeout=20)
+    with training("--resume", str(folder), out=tmp_path):
+        wait_for(page, lambda: page.get_by_text(CAPTION).inner_text() != seen)
+    page.close()
     viewer.stdin.close()
     viewer.wait(timeout=20)
-    page.close()

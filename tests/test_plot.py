@@ -2,19 +2,20 @@ import shutil
 
 import matplotlib.image
 import pytest
-from conftest import run_module
+from conftest import call, run_module
 
 from goalgan_bt.runs.frames import frame_paths
 from goalgan_bt.viz import pictures
 
 
 def plot(*arguments):
-    return run_module("plot", *arguments)
+    return call("plot", *arguments)
 
 
 def test_a_run_becomes_a_picture(folder, tmp_path):
-    done = plot(folder, "--out", tmp_path / "c.png")
-    assert done.returncode == 0, done.stderr
+    done = run_module("plot", folder, "--out", tmp_path / "c.png")
+    assert done.returncode == 0 and done.stderr == "", done.stderr
+    assert done.stdout == f"{tmp_path / 'c.png'}\n"
     pixels = matplotlib.image.imread(tmp_path / "c.png")
     assert min(pixels.shape[:2]) > 400
     assert len({tuple(p) for p in (pixels[::7, ::7, :3].reshape(-1, 3) * 255).astype(int)}) > 20
@@ -65,8 +66,8 @@ def test_damaged_runs_are_one_line(folder, tmp_path, damage):
     assert len(done.stderr.strip().splitlines()) == 1 and "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("where", ["nowhere", "."])
-def test_a_folder_that_is_no_run_is_one_line(where, tmp_path):
-    done = plot(tmp_path / where)
+@pytest.mark.parametrize(("run", "where"), [(run_module, "nowhere"), (call, ".")])
+def test_a_folder_that_is_no_run_is_one_line(run, where, tmp_path):
+    done = run("plot", tmp_path / where)
     assert done.returncode == 2
     assert "is no run" in done.stderr and len(done.stderr.strip().splitlines()) == 1

@@ -1,7 +1,9 @@
 """The benchmark of speed: its command end to end, and that it compares like with like."""
 
+import importlib
 import json
 import os
+import re
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -139,10 +141,27 @@ def test_the_profile_finds_all_phases_and_most_of_the_time(tmp_path):
     assert sum(shares) == pytest.approx(100, abs=2)
 
 
-def test_ranks_train_in_the_benchmark_too(tmp_path):
+RANKS = {"env": ("point_umaze",), "threads": (1, 2), "train_steps": 1, "num_envs": 4}
+
+
+def test_ranks_train_in_the_benchmark_too(rivals, capfd):
+    speed = importlib.import_module("speed")
+    planned = speed.measurements(speed.Settings(**RANKS, only=("training_ranks",)))
+    ready = speed.warm_up(planned)
+    assert [(m.name, m.threads) for m in planned] == [("training_ranks", n) for n in (1, 2)]
+    assert [(m.name, m.threads) for m in ready] == [("training_ranks", 2)]
+    printed, told = capfd.readouterr()
+    assert "no training_ranks for point_umaze: one rank is `training`" in printed
+    assert re.search(
+        r"^warm-up: point_umaze, 2 threads, training_ranks: [1-9]\S* steps/s$", told, re.M
+    )
+
+
+@pytest.mark.slow
+def test_ranks_come_into_the_table(tmp_path):
     file = tmp_path / "speed.json"
     words = "--env point_umaze --threads 1 2 --rounds 1 --train-steps 1 --only training_ranks"
     printed = run("speed.py", *words.split(), "--num-envs", 4, "--json", file)
     (row,) = json.loads(file.read_text())
-    assert (row["name"], row["threads"]) == ("training_ranks", 2)
+    assert (row["name"], row["threads"]) == ("training_ranks", 2) and row["steps_per_second"] > 0
     assert "no training_ranks for point_umaze: one rank is `training`" in printed

@@ -13,7 +13,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from conftest import run_module
+from conftest import call, run_module
 
 from goalgan_bt.learners import locomotion, table
 from goalgan_bt.runs import checkpoint, run_folder
@@ -28,12 +28,21 @@ Curve = statistics.Curve
 
 TINY = """
 envs = ["point_umaze"]
-seeds = 2
-flags = "--iterations 3 --rollout.num-envs 16 --coverage.rollouts 1 --coverage.every 5000"
+seeds = 1
+flags = "--iterations 25 --rollout.num-envs 16 --updates 2 --horizon 40 --gan.steps 5"
 [methods]
 recall_traces = ""
 goal_gan = "--method goal_gan"
 """
+ROOMS = """
+envs = ["four_rooms_7", "four_rooms_9 --horizon 100"]
+seeds = 2
+flags = "--total-steps 3000"
+[methods]
+recall_traces = ""
+actor_critic = "--method actor_critic"
+"""
+METHODS = "recall_traces", "actor_critic"
 
 
 def curve(*coverage):
@@ -97,86 +106,95 @@ def test_the_interval_covers_the_truth_as_often_as_it_says():
 def finished(tmp_path_factory):
     """A small study that has run."""
     root = tmp_path_factory.mktemp("study")
-    (root / "tiny.toml").write_text(TINY)
+    (root / "tiny.toml").write_text(ROOMS)
     done = run_module("study", root / "tiny.toml", "--out", root / "out", "--runs", root / "runs")
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 0 and not done.stderr, done.stderr
     return root, done.stdout
+
+
+def keys_of(rows):
+    return {(row["env"], row["method"], row["seed"]) for row in rows}
 
 
 def test_a_study_from_its_file_to_its_report(finished):
     root, printed = finished
-    out = root / "out/tiny"
-    assert printed.startswith("tiny: 4 runs of 4 to go") and "4/4 point_umaze" in printed
+    out, envs = root / "out/tiny", plan.load(str(root / "tiny.toml")).envs
+    assert printed.startswith("tiny: 8 runs of 8 to go") and " 8/8 four_rooms_" in printed
     with (out / "runs.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert tuple(rows[0]) == ("env", "method", "seed", "steps", "coverage")
-    keys = {(row["method"], row["seed"]) for row in rows}
-    assert keys == {(m, s) for m in ("recall_traces", "goal_gan") for s in "01"}
-    for key in keys:
-        steps = [int(row["steps"]) for row in rows if (row["method"], row["seed"]) == key]
+    assert keys_of(rows) == {(e, m, s) for e in envs for m in METHODS for s in "01"}
+    for key in keys_of(rows):
+        steps = [int(row["steps"]) for row in rows if keys_of([row]) == {key}]
         assert len(steps) >= 2 and steps == sorted(steps)
-    report = (out / "README.md").read_text()
-    assert "| goal_gan | 2 |" in report and "recall_traces over goal_gan" in report
-    assert "From `python -m goalgan_bt.study tiny.toml`." in report  # without where it lay
+    text = (out / "README.md").read_text()
+    assert "| actor_critic | 2 |" in text and "recall_traces over actor_critic" in text
+    assert "## four_rooms_9 --horizon 100" in text
+    assert "From `python -m goalgan_bt.study tiny.toml`." in text  # without where it lay
     assert (out / "curves.png").stat().st_size > 10_000
     with (out / "summary.csv").open() as file:
-        assert [row["method"] for row in csv.DictReader(file)] == ["recall_traces", "goal_gan"]
+        assert [row["method"] for row in csv.DictReader(file)] == [*METHODS, *METHODS]
 
 
 def test_what_is_finished_is_not_run_again(finished, tmp_path):
     root, _ = finished
     out = shutil.copytree(root / "out", tmp_path / "out")
     words = "study", root / "tiny.toml", "--out", out, "--runs", tmp_path / "runs"
-    again = run_module(*words)
+    again = call(*words)
     assert again.returncode == 0 and "to go" not in again.stdout
     assert not (tmp_path / "runs").exists()
     # A run that is missing in the tables but finished on disk is only read in.
+    missing = "four_rooms_7,actor_critic,1,"
     for name in ("runs.csv", "costs.csv"):
         lines = (out / f"tiny/{name}").read_text().splitlines(keepends=True)
-        kept = [line for line in lines if ",goal_gan,1," not in line]
+        kept = [line for line in lines if not line.startswith(missing)]
         (out / f"tiny/{name}").write_text("".join(kept))
+    runs = sorted(root.glob("runs/**/*"))
     words = "study", root / "tiny.toml", "--out", out, "--runs", root / "runs"
-    again = run_module(*words)
-    assert "tiny: 1 runs of 4 to go" in again.stdout
-    assert (out / "tiny/runs.csv").read_text().count(",goal_gan,1,") >= 2
+    again = call(*words)
+    assert "tiny: 1 runs of 8 to go" in again.stdout
+    assert (out / "tiny/runs.csv").read_text().count(missing) >= 2
+    assert sorted(root.glob("runs/**/*")) == runs
     # The same name with other flags would mix two experiments.
-    (tmp_path / "tiny.toml").write_text(TINY.replace("--iterations 3", "--iterations 4"))
-    other = run_module("study", tmp_path / "tiny.toml", "--out", out)
+    (tmp_path / "tiny.toml").write_text(ROOMS.replace("steps 3000", "steps 4000"))
+    other = call("study", tmp_path / "tiny.toml", "--out", out)
     assert other.returncode == 2 and other.stderr.count("\n") == 1
     assert "with the flags" in other.stderr
 
 
 def test_a_study_of_returns(tmp_path):
     pytest.importorskip("sb3_contrib")
-    methods = 'recall_traces = ""\ntrpo = "--backtracking.trace-length 0"'
-    flags = "--method trpo --total-steps 5000 --episodes 1"
-    text = f'envs = ["hopper"]\nseeds = 1\nflags = "{flags}"\n[methods]\n{methods}'
-    (tmp_path / "run.toml").write_text(text)
+    methods = 'recall_traces = ""\nsac = "--backtracking.trace-length 0"'
+    flags = "--method sac --total-steps 50 --episodes 1"
+    study = f'envs = ["hopper"]\nseeds = 1\nflags = "{flags}"\n[methods]\n{methods}'
+    (tmp_path / "run.toml").write_text(study)
     words = "study", tmp_path / "run.toml", "--out", tmp_path, "--runs", tmp_path / "runs"
-    done = run_module(*words)
+    spec = plan.load(str(tmp_path / "run.toml"))
+    by_hand = plan.words(plan.grid(spec)[0])
+    call("train", *by_hand, "--out", tmp_path / "runs/run/hopper/recall_traces-s0")
+    done = call(*words)  # it trains the other one
     assert done.returncode == 0 and "2/2 hopper" in done.stdout, done.stderr
     with (tmp_path / "run/runs.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert tuple(rows[0]) == ("env", "method", "seed", "steps", "return")
-    assert sorted({int(row["steps"]) for row in rows}) == [4096, 8192]
-    report = (tmp_path / "run/README.md").read_text()
-    assert "| recall_traces less trpo | 1 |" in report and "to 0.63" not in report
-    assert "Not finished" not in report
+    assert sorted({int(row["steps"]) for row in rows}) == list(range(2, 51, 2))
+    text = (tmp_path / "run/README.md").read_text()
+    assert "| recall_traces less sac | 1 |" in text and "to 0.63" not in text
+    assert "Not finished" not in text
     # A finished run leaves no checkpoint, and is only read in all the same.
     made = sorted((tmp_path / "runs").glob("*/*/*/*/ended.txt"))
     for name in ("runs.csv", "costs.csv"):
         lines = (tmp_path / f"run/{name}").read_text().splitlines(keepends=True)
         (tmp_path / f"run/{name}").write_text(
-            "".join(line for line in lines if ",trpo,0," not in line)
+            "".join(line for line in lines if ",sac,0," not in line)
         )
-    part = run_module(*words, "--report")
+    part = call(*words, "--report")
     assert part.returncode == 0, part.stderr
     assert "**Not finished: 1 of 2 runs are in.**" in (tmp_path / "run/README.md").read_text()
-    again = run_module(*words)
+    again = call(*words)
     assert again.returncode == 0 and "1 runs of 2 to go" in again.stdout
     assert len(made) == 2 == len(sorted((tmp_path / "runs").glob("*/*/*/*/ended.txt")))
     # In the picture there are the curves.
-    spec = plan.load(str(tmp_path / "run.toml"))
     drawn = report.draw(spec, report.curves(Tables(tmp_path / "run", "return")))
     low, high = drawn.axes[0].get_ylim()
     returns = [float(row["return"]) for row in rows]
@@ -189,7 +207,7 @@ def test_a_damaged_table_is_one_line(finished, value, tmp_path):
     out = shutil.copytree(root / "out", tmp_path / "out")
     text = (out / "tiny/runs.csv").read_text().rstrip()
     (out / "tiny/runs.csv").write_text(text[: text.rindex(",") + 1] + value + "\n")
-    done = run_module("study", root / "tiny.toml", "--out", out, "--report")
+    done = call("study", root / "tiny.toml", "--out", out, "--report")
     assert done.returncode == 2 and "runs.csv is damaged" in done.stderr
     assert done.stderr.count("\n") == 1
 
@@ -209,61 +227,72 @@ def test_differences_are_paired_by_seed():
     assert statistics.area(Curve(steps[:1], np.array([7.0]))) == 7.0
 
 
-def test_a_run_that_was_cut_off_goes_on(finished, tmp_path):
-    root, _ = finished
-    run = plan.grid(plan.load(str(root / "tiny.toml")))[0]
-    place = shutil.copytree(root / "runs/tiny/point_umaze/recall_traces-s0", tmp_path / "run")
-    (folder,) = place.iterdir()
+def test_a_run_that_was_cut_off_goes_on(tmp_path):
+    flags = "--iterations 2 --rollout.num-envs 16 --updates 2 --horizon 40 --gan.steps 5"
+    run = plan.Trial("point_umaze", "recall_traces", 0, flags)
+    assert call("train", *plan.words(run), "--out", tmp_path).returncode == 0
+    (folder,) = tmp_path.iterdir()
     (folder / "ended.txt").unlink()
-    assert execute.perform(run, place) == folder  # it was killed just before it could say so
-    longer = run._replace(flags=run.flags.replace("--iterations 3", "--iterations 4"))
+    assert execute.perform(run, tmp_path) == folder  # it was killed just before it could say so
+    longer = run._replace(flags=flags.replace("--iterations 2", "--iterations 3"))
     with pytest.raises(RunError, match="was begun with other settings"):
-        execute.perform(longer, place)
+        execute.perform(longer, tmp_path)
     settings = (folder / "config.json").read_text()
-    (folder / "config.json").write_text(settings.replace('"iterations": 3', '"iterations": 4'))
-    assert execute.perform(longer, place) == folder
-    assert (folder / "metrics.csv").read_text().splitlines()[-1].startswith("4,")
+    (folder / "config.json").write_text(settings.replace('"iterations": 2', '"iterations": 3'))
+    assert execute.perform(longer, tmp_path) == folder
+    assert (folder / "metrics.csv").read_text().splitlines()[-1].startswith("3,")
     assert (folder / "ended.txt").read_text().startswith("complete")
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 2)])
-def test_an_interrupted_study_ends_its_trainings(tmp_path, number, code):
-    """They have left their checkpoints when it ends, so that the same command goes on."""
-    text = TINY.replace("--iterations 3", "--iterations 12").replace("seeds = 2", "seeds = 1")
-    (tmp_path / "tiny.toml").write_text(text.replace("--coverage.every 5000", ""))
-    words = ["tiny.toml", "--out", "out", "--runs", "runs", "--processes", "2"]
+@contextlib.contextmanager
+def interrupted(number, code, runs, *words):
+    """A study that a signal ends as soon as two trainings have begun; gives their tables."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "goalgan_bt.study", *words],
-        cwd=tmp_path,
+        [sys.executable, "-m", "goalgan_bt.study", *map(str, words)],
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
     )
     try:
         deadline = time.monotonic() + 90
-        while len(begun := list(tmp_path.glob("runs/**/metrics.csv"))) < 2:
+        while len(begun := list(runs.glob("**/metrics.csv"))) < 2:
             assert time.monotonic() < deadline and process.poll() is None
-            time.sleep(0.1)
+            time.sleep(0.02)
         process.send_signal(number)
         _, errors = process.communicate(timeout=60)
         with pytest.raises(ProcessLookupError):
             os.killpg(process.pid, 0)  # nobody is left
+        assert process.returncode == code
+        assert errors == "error: interrupted: the same command goes on with what is missing\n"
+        yield begun
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
-    assert process.returncode == code
-    assert errors == "error: interrupted: the same command goes on with what is missing\n"
-    for metrics in begun:
-        assert (metrics.parent / "checkpoint.pt").exists()
-    if number == signal.SIGTERM:
-        return  # the same from here on
-    again = subprocess.run(
-        [sys.executable, "-m", "goalgan_bt.study", *words], cwd=tmp_path, timeout=300, check=False
-    )
-    assert again.returncode == 0
-    assert len(list(tmp_path.glob("runs/**/metrics.csv"))) == 2  # no run was begun twice
-    for metrics in begun:
-        assert metrics.read_text().splitlines()[-1].startswith("12,")
+
+
+def study_of(text, folder):
+    """The words of a study `tiny` in a folder, two runs at a time."""
+    (folder / "tiny.toml").write_text(text)
+    places = "--out", folder / "out", "--runs", folder / "runs"
+    return folder / "tiny.toml", *places, "--processes", 2
+
+
+def test_an_interrupted_study_ends_its_trainings(tmp_path):
+    """They have left their checkpoints when it ends, so that the same command goes on."""
+    words = study_of(TINY, tmp_path)
+    with interrupted(signal.SIGINT, 130, tmp_path / "runs", *words) as begun:
+        assert all((metrics.parent / "checkpoint.pt").exists() for metrics in begun)
+    again = call("study", *words)
+    assert again.returncode == 0 and not again.stderr
+    assert sorted(tmp_path.glob("runs/**/metrics.csv")) == sorted(begun)  # none was begun twice
+    assert all(each.read_text().splitlines()[-1].startswith("25,") for each in begun)
+    assert "recall_traces over goal_gan" in (tmp_path / "out/tiny/README.md").read_text()
+
+
+def test_a_study_that_is_killed_ends_its_trainings(tmp_path):
+    words = study_of(ROOMS.replace("steps 3000", "steps 1000000000"), tmp_path)
+    with interrupted(signal.SIGTERM, 2, tmp_path / "runs", *words):
+        pass
 
 
 def test_a_training_that_is_just_being_started_ends_too(tmp_path, monkeypatch):
@@ -359,7 +388,7 @@ def test_two_studies_do_not_share_a_table(finished):
     root, _ = finished
     tables = Tables(root / "out/tiny", "coverage")
     words = "study", root / "tiny.toml", "--out", root / "out"
-    other = run_module(*words)
+    other = call(*words)
     assert other.returncode == 2 and "another study's at work" in other.stderr
     del tables
 
@@ -368,18 +397,18 @@ def test_a_table_cut_off_between_its_files_mends_itself(finished, tmp_path):
     root, _ = finished
     out = shutil.copytree(root / "out/tiny", tmp_path / "tiny")
     lines = (out / "costs.csv").read_text().splitlines(keepends=True)
-    (out / "costs.csv").write_text("".join(line for line in lines if ",goal_gan,0," not in line))
-    tables = Tables(out, "coverage")
-    keys = {(row["method"], row["seed"]) for row in tables.curves}
-    assert len(keys) == 3 and ("goal_gan", "0") not in keys
+    cut = "four_rooms_7,actor_critic,0,"
+    (out / "costs.csv").write_text("".join(line for line in lines if not line.startswith(cut)))
+    keys = keys_of(Tables(out, "coverage").curves)
+    assert len(keys) == 7 and ("four_rooms_7", "actor_critic", "0") not in keys
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (TINY.replace("seeds = 2", "seeds = true"), "seeds is a number"),
-        (TINY.replace("seeds = 2", "seeds = 2\nfirst_seed = -1"), "first_seed from 0"),
-        (TINY.replace("seeds = 2", f"seeds = 2\nfirst_seed = {10**13}"), "--seed must be"),
+        (TINY.replace("seeds = 1", "seeds = true"), "seeds is a number"),
+        (TINY.replace("seeds = 1", "seeds = 2\nfirst_seed = -1"), "first_seed from 0"),
+        (TINY.replace("seeds = 1", f"seeds = 2\nfirst_seed = {10**13}"), "--seed must be"),
         (TINY.replace("goal_gan =", '"../a" ='), "a method's name"),
         (TINY.replace("--method goal_gan", "--seed 7"), "--seed is the study's own"),
         (TINY.replace('"point_umaze"', '"point_umaze --seed 7"'), "--seed is the study's own"),
@@ -389,6 +418,7 @@ def test_a_table_cut_off_between_its_files_mends_itself(finished, tmp_path):
         (TINY.replace('["point_umaze"]', '["point_umaze", "hopper"]'), "others a return"),
         ("envs = ", "cannot read"),
         ('envs = ["point_umaze"]\nseeds = 1', "needs methods"),
+        (ROOMS.replace("four_rooms_7", "four_rooms_5"), "four_rooms_5"),
         ('envs = ["moon"]\nseeds = 1\n[methods]\na = ""', "moon"),
         ('envs = ["point_umaze"]\nseeds = 1\n[methods]\na = "--speed 9"', "a: "),
         ('envs = ["point_umaze"]\nseeds = 1\n[methods]\na = 3', "texts"),
@@ -404,11 +434,18 @@ def test_bad_files_end_in_one_line(text, words, tmp_path):
         plan.load(str(tmp_path / "bad.toml"))
 
 
-def test_unknown_and_unfinished_studies_end_in_one_line(tmp_path):
-    for words in (["nothing"], ["point_umaze", "--report"], ["point_umaze", "--processes", "-1"]):
-        done = run_module("study", *words, "--out", tmp_path)
-        assert done.returncode == 2 and done.stderr.startswith("error: ")
-        assert done.stderr.count("\n") == 1
+@pytest.mark.parametrize(
+    ("run", "words"),
+    [
+        (call, ["nothing"]),
+        (call, ["point_umaze", "--report"]),
+        (run_module, ["point_umaze", "--processes", "-1"]),
+    ],
+)
+def test_unknown_and_unfinished_studies_end_in_one_line(run, words, tmp_path):
+    done = run("study", *words, "--out", tmp_path)
+    assert done.returncode == 2 and done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize("name", [path.stem for path in plan.SHIPPED.glob("*.toml")])

@@ -11,7 +11,7 @@ import pytest
 import viser
 import websockets.sync.client
 import zstandard
-from conftest import TINY, run_module, serve
+from conftest import TINY, call, run_module, serve
 from viser import _messages
 
 from goalgan_bt.envs import maze as mazes
@@ -472,16 +472,16 @@ def test_many_wishes_are_one_attempt(view, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("run", "arguments", "message"),
     [
-        ([], "python -m goalgan_bt.viz RUN"),
-        (["nowhere"], "error: nowhere is no run"),
-        (["nowhere", "--port", "99999"], "--port must be between 0 and 65535"),
-        (["nowhere", "--frobnicate"], "--help"),
+        (call, [], "python -m goalgan_bt.viz RUN"),
+        (call, ["nowhere"], "error: nowhere is no run"),
+        (call, ["nowhere", "--port", "99999"], "--port must be between 0 and 65535"),
+        (run_module, ["nowhere", "--frobnicate"], "--help"),
     ],
 )
-def test_bad_input_ends_in_one_line_and_code_2(arguments, message):
-    done = run_module("viz", *arguments)
+def test_bad_input_ends_in_one_line_and_code_2(run, arguments, message):
+    done = run("viz", *arguments)
     assert done.returncode == 2 and message in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
 

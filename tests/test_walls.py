@@ -1,4 +1,5 @@
-"""No body passes a wall, at any speed that a policy can reach: a million steps of trying hard."""
+"""No body passes a wall, at any speed that a policy can reach, however hard it tries: 100 thousand
+steps of each kind of trying in every run of the tests, a million with `pytest -m slow`."""
 
 import numpy as np
 import pytest
@@ -6,8 +7,6 @@ import pytest
 from goalgan_bt import envs
 from goalgan_bt.envs.ant_maze import TORSO_RADIUS
 from goalgan_bt.envs.point_maze import RADIUS
-
-STEPS = 500_000  # per body, start speed and test below; two of each
 
 
 def depth_in_walls(maze, xy, radius):
@@ -23,9 +22,10 @@ def depth_in_walls(maze, xy, radius):
     return radius - distance.min(axis=1)
 
 
+@pytest.mark.parametrize("steps", [100_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("speed", [0.0, 3.0])
 @pytest.mark.parametrize(("name", "radius"), [("point_umaze", RADIUS), ("ant_umaze", TORSO_RADIUS)])
-def test_full_force_does_not_press_a_body_into_a_wall(name, radius, speed):
+def test_full_force_does_not_press_a_body_into_a_wall(name, radius, speed, steps):
     """Bang-bang actions held for random times, from every cell, with and without a run-up."""
     n = 500
     env = envs.make(name, n)
@@ -45,7 +45,7 @@ def test_full_force_does_not_press_a_body_into_a_wall(name, radius, speed):
     restart(ids)
     actions = rng.choice([-1.0, 1.0], (n, env.act_dim))
     worst, fastest = -np.inf, 0.0
-    for _ in range(STEPS // n):
+    for _ in range(steps // n):
         actions = np.where(rng.random(actions.shape) < 0.05, -actions, actions)
         step = env.step(ids, actions)
         states = step.states
@@ -55,4 +55,4 @@ def test_full_force_does_not_press_a_body_into_a_wall(name, radius, speed):
         if done.any():
             restart(ids[done])
     assert fastest > 3.0  # it did try
-    assert worst < 0.01
+    assert -0.1 < worst < 0.01  # it came there, and no farther

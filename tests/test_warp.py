@@ -1,13 +1,12 @@
 """mujoco-warp against MuJoCo, on Warp's CPU device; the mathematics on tensors against numpy's."""
 
-import os
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from conftest import TINY, run_module
+from conftest import TINY, call
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -266,11 +265,10 @@ def test_rk4_runs_too(worlds):
     assert (env.step(np.arange(2), np.ones((2, 2))).states[:, 2:] > 0).all()
 
 
-def test_training_on_mujoco_warp(tmp_path):
+def test_training_on_mujoco_warp(worlds, tmp_path):
+    worlds("point_umaze")
     tiny = f"{TINY} --iterations 1 --updates 1 --rollout.steps 10 --horizon 40 --viz none"
-    done = run_module(
-        "train", *tiny.split(), "--physics", "warp", "--device", "cpu", "--out", tmp_path
-    )
+    done = call("train", *tiny.split(), "--physics", "warp", "--device", "cpu", "--out", tmp_path)
     assert done.returncode == 0, done.stderr
     run = next(tmp_path.iterdir())
     assert table.load(run).physics == "warp"
@@ -279,9 +277,8 @@ def test_training_on_mujoco_warp(tmp_path):
 
 
 def test_training_without_the_extra_ends_in_one_line(tmp_path, monkeypatch):
-    (tmp_path / "mujoco_warp.py").write_text("raise ImportError('no', name='mujoco_warp')\n")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setitem(sys.modules, "mujoco_warp", None)
     words = ["--env", "ant_umaze", "--physics", "warp", "--viz", "none", "--out", tmp_path / "out"]
-    done = run_module("train", *words)
+    done = call("train", *words)
     assert done.returncode == 2 and not (tmp_path / "out").exists()
-    assert "install the extra `gpu`" in done.stderr.splitlines()[-1]
+    assert done.stderr.count("\n") == 1 and "install the extra `gpu`" in done.stderr

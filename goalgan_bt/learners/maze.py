@@ -128,6 +128,7 @@ def prepared(cfg: MazeConfig) -> Iterator[World]:
     """
     ranks.begin()
     try:
+        envs_per_rank(cfg)  # or there will be no run
         env = make_env(cfg, 1)
         yield World(env.name, env.maze)
     finally:

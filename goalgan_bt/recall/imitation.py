@@ -57,11 +57,11 @@ def imitate_within(
     for taken in range(steps):
         start = read()
         step()
-        if (here := kl()) <= max_kl:
-            reached = here
-            continue
         half, found = (read() - start) / 2, None
         if torch.isfinite(half).all():
+            if (here := kl()) <= max_kl:
+                reached = here
+                continue
             found = line_search(evaluate, start, half, max_kl, halvings, 0.5)
         if found is None:
             put(start)
