@@ -28,7 +28,7 @@ from goalgan_bt.curriculum.settings import GanConfig, GoalsConfig, conflicts
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.runs import checkpoint
 from goalgan_bt.runs.errors import UsageError
-from goalgan_bt.runs.ranges import faults
+from goalgan_bt.runs.ranges import require, require_whole
 
 SIDE = 10.0  # metres, of the papers' goal box, for which the default distances are made
 WORLDLY = ("feasible", "oracle")  # sources of goals that a curriculum alone does not have
@@ -202,8 +202,7 @@ class GoalCurriculum:
             OSError: if the file cannot be opened.
             ValueError: if it is damaged or of another version.
         """
-        try:
-            state = checkpoint.read(Path(path))
+        with checkpoint.loaded(Path(path)) as state:
             made = state["made"]
             goals = None if made["goals"] is None else GoalsConfig(**made["goals"])
             gan = GanConfig(**made["gan"])
@@ -214,11 +213,6 @@ class GoalCurriculum:
             curriculum._asked, curriculum._begun = map(bool, state["flags"])
             curriculum._pending = [goals.numpy() for goals in state["pending"]]
             curriculum._check_loaded()
-        except OSError:
-            raise
-        except Exception as error:  # torch raises many kinds for a damaged file
-            why = f"it is damaged or of another version ({checkpoint.reason(error)})"
-            raise ValueError(f"cannot load {path}: {why}") from error
         return curriculum
 
     def _check_loaded(self) -> None:
@@ -358,14 +352,12 @@ def _check(seed: int, every: int, goals: GoalsConfig, gan: GanConfig) -> None:
     Raises:
         UsageError: naming it.
     """
-    for name, number, least in (("seed", seed, 0), ("every", every, 1)):
-        if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < least:
-            raise UsageError(f"{name} must be a whole number from {least} on, not {number!r}")
+    require_whole("seed", seed, 0)
+    require_whole("every", every, 1)
     for settings, kind in ((goals, GoalsConfig), (gan, GanConfig)):
         if not isinstance(settings, kind):
             raise UsageError(f"settings must be a {kind.__name__}, not {settings!r}")
-        for name, problem in faults(settings):
-            raise UsageError(f"{name} {problem}")
+        require(settings)
     for name, problem in conflicts(goals):
         raise UsageError(f"{name} {problem}")
 

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
+from goalgan_bt.agent.networks import first_weights
 from goalgan_bt.agent.rollout import Float32
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.learners.gaussian_agent import AgentImitation, GaussianAgent
@@ -123,8 +124,7 @@ class RecallTraces(BaseCallback):
     def _new_model(self, obs_dim: int, act_dim: int) -> BacktrackingModel | ForwardModel:
         self._sizes = obs_dim, act_dim
         cfg = BacktrackingConfig(batch=256, steps=self.cfg.model_steps)
-        with torch.random.fork_rng(devices=[]):  # the agent's own noise stays as it would be alone
-            torch.manual_seed(self._seed)
+        with first_weights(self._seed):  # the agent's own noise stays as it would be alone
             if self.cfg.model == "forward":
                 return ForwardModel(obs_dim, act_dim, cfg, self._noise)
             return BacktrackingModel(obs_dim, act_dim, cfg=cfg, generator=self._noise)
@@ -263,7 +263,7 @@ class RecallTraces(BaseCallback):
         Returns:
             threshold: L; length, best_length: mean actions of all remembered trajectories, and of
             those that teach; action_nll, state_nll, or forward_nll: see the models; valid: share
-            of the steps of the traces before they ended; loss, kl, log_pi: see `_imitate`;
+            of the steps of the traces before they ended; loss, kl, log_pi: see `AgentImitation`;
             log_ratio: log pi(a | s) - log q(a | s') before it, nats per step: of the paper's lower
             bound of log p(R > L) (section 4) the part that is known; the world's transitions are
             not. Nothing while there is too little to learn from.
@@ -415,17 +415,11 @@ class RecallTraces(BaseCallback):
             OSError: if the file cannot be opened.
             ValueError: if it is damaged, or made with another `RecallConfig.model`.
         """
-        try:
-            state = checkpoint.read(Path(path))
+        with checkpoint.loaded(Path(path)) as state:
             callback = cls(cfg or RecallConfig(**state["cfg"]), seed)
             if (kind := state["cfg"]["model"]) != callback.cfg.model:
                 raise ValueError(f"its model is {kind}, not {callback.cfg.model}")
             callback.load_state_dict(state)
-        except OSError:
-            raise
-        except Exception as error:  # torch raises many kinds for a damaged file
-            why = f"it is damaged or of other settings ({checkpoint.reason(error)})"
-            raise ValueError(f"cannot load {path}: {why}") from error
         return callback
 
 

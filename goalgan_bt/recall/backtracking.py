@@ -20,7 +20,7 @@ from goalgan_bt.agent.networks import MLP, RELU, TANH, Linearised, first_weights
 from goalgan_bt.recall.settings import BacktrackingConfig
 from goalgan_bt.runs import checkpoint
 from goalgan_bt.runs.errors import UsageError
-from goalgan_bt.runs.ranges import faults
+from goalgan_bt.runs.ranges import require, require_whole
 
 Array = NDArray[np.floating]
 
@@ -102,13 +102,10 @@ class BacktrackingModel(nn.Module):
     ) -> None:
         super().__init__()
         self.cfg = cfg = cfg or BacktrackingConfig()
-        for name, size, least in (
-            ("state_dim", state_dim, 1), ("act_dim", act_dim, 1), ("goal_dim", goal_dim, 0)
-        ):  # fmt: skip
-            if not isinstance(size, int | np.integer) or size < least:
-                raise UsageError(f"{name} must be a whole number from {least} on, not {size!r}")
-        for name, problem in faults(cfg):
-            raise UsageError(f"{name} {problem}")
+        require_whole("state_dim", state_dim, 1)
+        require_whole("act_dim", act_dim, 1)
+        require_whole("goal_dim", goal_dim, 0)
+        require(cfg)
         told = state_dim + (goal_dim if cfg.conditioned else 0)
         with first_weights(seed if generator is None else None):
             self.action_net = MLP((told, *cfg.hidden, act_dim), TANH)
@@ -170,8 +167,7 @@ class BacktrackingModel(nn.Module):
             metrics = {"held_out_action_nll": action_nll, "held_out_state_nll": state_nll}
 
         steps, size = self.cfg.steps if steps is None else steps, self.cfg.batch
-        if not isinstance(steps, int | np.integer) or steps < 0:
-            raise UsageError(f"steps must be a whole number from 0 on, not {steps!r}")
+        require_whole("steps", steps, 0)
         drawn = torch.randint(rows, (max(1, steps) * size,), generator=self._rng).numpy()
         batch = _batch(data, drawn)
         if not all(x.isfinite().all() for x in batch):

@@ -33,18 +33,20 @@ def restore(module: Any, state: dict[str, Any]) -> None:
         group["lr"] = rate
 
 
-def read(path: Path) -> Any:
-    """What `save` wrote.
+@contextmanager
+def loaded(path: Path) -> Iterator[Any]:
+    """What `save` wrote, while it is taken over.
 
     Raises:
         OSError: if the file cannot be opened.
-        ValueError: if it is damaged.
+        ValueError: for whatever goes wrong while it is read and taken over.
     """
     data = path.read_bytes()
     try:
-        return torch.load(io.BytesIO(data), weights_only=True)
+        yield torch.load(io.BytesIO(data), weights_only=True)
     except Exception as error:  # torch raises many kinds for a damaged file
-        raise ValueError(reason(error)) from error
+        why = f"it is damaged or of other settings or another version ({reason(error)})"
+        raise ValueError(f"cannot load {path}: {why}") from error
 
 
 @contextmanager

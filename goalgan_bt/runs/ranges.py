@@ -14,6 +14,8 @@ from dataclasses import dataclass, fields, is_dataclass
 from numbers import Integral, Real
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from goalgan_bt.runs.errors import UsageError
+
 SANE = 1e12  # no count, length or rate of ours is larger
 
 
@@ -62,6 +64,26 @@ def faults(settings: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
             yield from faults(value, f"{name}.")
         elif problem := _problem(hints[field.name], value):
             yield name, problem
+
+
+def require(settings: Any) -> None:
+    """Refuse settings that are out of their ranges.
+
+    Raises:
+        UsageError: naming the first such setting.
+    """
+    for name, problem in faults(settings):
+        raise UsageError(f"{name} {problem}")
+
+
+def require_whole(name: str, number: Any, least: int) -> None:
+    """Refuse what is no whole number, or too small a one.
+
+    Raises:
+        UsageError: naming it.
+    """
+    if isinstance(number, bool) or not isinstance(number, Integral) or number < least:
+        raise UsageError(f"{name} must be a whole number from {least} on, not {number!r}")
 
 
 def _problem(hint: Any, value: Any) -> str | None:
