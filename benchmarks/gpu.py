@@ -154,8 +154,7 @@ def coverage(run: Path, device: str) -> list[dict[str, Any]]:
         cfg = replace(cfg, physics=physics, device=where)
         test_goals = make_env(cfg, 1, maze).test_goals()
         env = make_env(cfg, len(test_goals) * (cfg.coverage.rollouts + 1), maze)
-        policy = GaussianPolicy(env.obs_dim, env.act_dim, cfg.policy)
-        maze_learner.load_policy(policy, run)
+        policy, _ = maze_learner.load_policy(env, cfg, run)
         noise = torch.Generator().manual_seed(0)
         found = both_policies(env, policy, test_goals, cfg.coverage.rollouts, noise)
         row = {"name": "coverage", "env": cfg.env, "physics": physics, "run": run.name}

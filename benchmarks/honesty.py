@@ -18,9 +18,8 @@ import numpy as np
 import torch
 
 from goalgan_bt.agent.coverage import coverage
-from goalgan_bt.agent.policy import Actor, GaussianPolicy
-from goalgan_bt.envs.goal_env import GoalEnv
-from goalgan_bt.learners import maze_config, maze_learner, table
+from goalgan_bt.agent.policy import Actor
+from goalgan_bt.learners import table
 from goalgan_bt.learners.maze import TEST_ENVS
 from goalgan_bt.learners.maze_config import make_env
 from goalgan_bt.runs.command_line import parse
@@ -47,20 +46,15 @@ class Settings:
     """Where to write the rows."""
 
 
-def learned(cfg: maze_config.MazeConfig, env: GoalEnv, folder: Path) -> GaussianPolicy:
-    """The policy of a run."""
-    policy = GaussianPolicy(env.obs_dim, env.act_dim, cfg.policy)
-    maze_learner.load_policy(policy, folder)
-    return policy
-
-
 def integrators(folder: Path, rollouts: int) -> dict[str, float]:
     """Coverage of a run's policy under each integrator."""
     cfg, found = table.load(folder), {}
     for integrator in ("implicitfast", "rk4"):
         env = make_env(replace(cfg, integrator=integrator), TEST_ENVS)
         noise = torch.Generator().manual_seed(cfg.seed)
-        measured = coverage(env, learned(cfg, env, folder), env.test_goals(), rollouts, noise)
+        measured = coverage(
+            env, load_policy(env, cfg, folder)[0], env.test_goals(), rollouts, noise
+        )
         found[integrator] = float(measured.stochastic.mean())
         found[f"{integrator}_deterministic"] = float(measured.deterministic.mean())
     return found
@@ -75,7 +69,7 @@ def in_gymnasium(folder: Path, episodes: int) -> dict[str, float]:
     cfg = table.load(folder)
     ours = make_env(cfg, 1)
     theirs = gymnasium.make("PointMaze_UMaze-v3", continuing_task=False)
-    act, successes = Actor(learned(cfg, ours, folder)), np.zeros((len(CELLS), episodes))
+    act, successes = Actor(load_policy(ours, cfg, folder)[0]), np.zeros((len(CELLS), episodes))
     for i, cell in enumerate(CELLS):
         for episode in range(episodes):
             options = {"reset_cell": np.array(START), "goal_cell": np.array(cell)}

@@ -58,17 +58,18 @@ class AntMaze(MazeEnv):
     (14). Achieved goal: x, y of the centre of mass.
 
     The Ant looks the same after a quarter turn with its legs renumbered. The policy sees it, and
-    moves it, in the one of the four equal numberings whose front points most nearly at the goal:
-    what it learns about walking one way holds for all. Observation, 39 numbers: qpos and qvel so
-    numbered, then the offset from the centre of mass to the goal; the front's direction; the
-    offset and the velocity along the front and to its left; and the lean of the torso. The offset
-    d is told as d / (1 m + |d|): a goal that is far looks like one that is less far in the same
-    direction, so that the Ant already walks towards goals which it has never reached.
+    moves it, in the one of the four equal numberings whose front points most nearly along the way
+    to the goal (at the goal where there is no heading): what it learns about walking one way holds
+    for all. Observation, 39 numbers: qpos and qvel so numbered, then the offset from the centre of
+    mass to the goal along the way; the front's direction; the offset and the velocity along the
+    front and to its left; and the lean of the torso. With a heading the straight offset follows.
+    Offsets are squashed: the Ant walks towards goals which it has never reached as it does to
+    nearer ones.
     """
 
     success_radius = 1.0
     act_dim = 8
-    obs_dim = 39
+    own_obs_dim = 39
     model_of = staticmethod(build_model)
     start_state = np.array([0, 0, 0.55, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1] + [0] * 14, float)
 
@@ -80,9 +81,10 @@ class AntMaze(MazeEnv):
 
     def observations(self, states: Array, goals: Array, achieved: Array | None = None) -> Array:
         xp = namespace(states)
-        offset = goals - (self.achieved_goals(states) if achieved is None else achieved)
-        offset /= 1.0 + _length(offset)
-        states = renumbered(states, quarter_turns(states, goals))
+        achieved = self.achieved_goals(states) if achieved is None else achieved
+        along = self.along(achieved, goals)
+        offset = self.squashed(along)
+        states = renumbered(states, quarter_turns(states, self._target(states, goals, along)))
         along_x, _, along_z = axes_on_map(states[:, 3:7])
         front = along_x / (_length(along_x) + 1e-9)
         velocity = states[:, 15:17]
@@ -94,13 +96,24 @@ class AntMaze(MazeEnv):
         obs[:, 33], obs[:, 34] = _ahead_and_left(offset, front)
         obs[:, 35], obs[:, 36] = _ahead_and_left(velocity, front)
         obs[:, 37], obs[:, 38] = _ahead_and_left(along_z, front)
+        if self.heading is not None:
+            obs[:, 39:] = self.squashed(goals - achieved)
         return obs
 
     def to_body(self, actions: Array, states: Array, goals: Array) -> Array:
-        return _renumber_actions(actions, -quarter_turns(states, goals))
+        return _renumber_actions(actions, -self._turns(states, goals))
 
     def from_body(self, actions: Array, states: Array, goals: Array) -> Array:
-        return _renumber_actions(actions, quarter_turns(states, goals))
+        return _renumber_actions(actions, self._turns(states, goals))
+
+    def _turns(self, states: Array, goals: Array) -> Array:
+        """By how many quarter turns each front is off its way, (n,)."""
+        along = None if self.heading is None else self.along(self.achieved_goals(states), goals)
+        return quarter_turns(states, self._target(states, goals, along))
+
+    def _target(self, states: Array, goals: Array, along: Array | None) -> Array:
+        """What the fronts shall point at, (n, 2)."""
+        return goals if self.heading is None else states[:, :2] + along
 
     def achieved_goals(self, states: Array) -> Array:
         """Centre of mass of the whole Ant, (n, 2): what MuJoCo calls the torso's subtree_com.

@@ -1,14 +1,18 @@
 """The contract between the world and the learner: many simulations of one goal-reaching task."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from goalgan_bt.envs.arrays import Array, namespace
+from goalgan_bt.envs.arrays import Array, namespace, put
 from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
 
 Ids = NDArray[np.int64]
+# Offsets from places to goals, (n, goal_dim) each, along the way there: as far as the way is long,
+# in the direction in which it begins.
+Heading = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 class PhysicsError(ValueError):
@@ -52,7 +56,10 @@ class GoalEnv:
         action_repeat: steps for which each action is held. Success, failure and the end of time
             are checked after each action; all counts are of steps.
         success_radius: metres.
-        obs_dim, act_dim, goal_dim, state_dim: sizes of one row.
+        act_dim, goal_dim, state_dim: sizes of one row; own_obs_dim: of an observation without a
+            heading.
+        heading: tells offsets to goals along the way, where somebody knows the ways; observations
+            then have goal_dim numbers more.
         start_state: (state_dim,) where episodes begin.
         goal_low, goal_high: (goal_dim,) the box in which goals are proposed, metres.
         maze: the layout, or None where there are no walls.
@@ -63,11 +70,12 @@ class GoalEnv:
     dt: float
     success_radius: float
     act_dim: int
-    obs_dim: int
+    own_obs_dim: int
     start_state: FloatArray
     goal_low: FloatArray
     goal_high: FloatArray
     maze: Maze | None = None
+    heading: Heading | None = None
 
     def __init__(self, num_envs: int, horizon: int, action_repeat: int) -> None:
         self.num_envs = num_envs
@@ -81,6 +89,11 @@ class GoalEnv:
     def goal_dim(self) -> int:
         """Size of a goal."""
         return len(self.goal_low)
+
+    @property
+    def obs_dim(self) -> int:
+        """Size of an observation."""
+        return self.own_obs_dim + (0 if self.heading is None else self.goal_dim)
 
     @property
     def state_dim(self) -> int:
@@ -149,6 +162,21 @@ class GoalEnv:
         return states
 
     # What all bodies share.
+
+    def along(self, achieved: Array, goals: Array) -> Array:
+        """Offsets from places to goals, both (n, goal_dim), along the way where there is a
+        `heading`, else on the straight line."""
+        if self.heading is None:
+            return goals - achieved
+        if isinstance(achieved, np.ndarray):
+            return self.heading(achieved, goals)
+        return put(self.heading(achieved.cpu().numpy(), goals.cpu().numpy()), achieved)
+
+    def squashed(self, offsets: Array) -> Array:
+        """Offsets d, (n, goal_dim), as d / (success_radius + |d|): what is far looks like what is
+        less far in the same direction."""
+        length = namespace(offsets).sqrt((offsets * offsets).sum(axis=1))
+        return offsets / (self.success_radius + length)[:, None]
 
     def reset(self, ids: Ids, goals: FloatArray, states: FloatArray | None = None) -> None:
         """Begin new episodes in some simulations.

@@ -15,6 +15,7 @@ from goalgan_bt.envs.arrays import Array, namespace, put
 from goalgan_bt.envs.goal_env import Ids
 from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
 from goalgan_bt.envs.mujoco_env import INTEGRATORS, MazeEnv, add_walls
+from goalgan_bt.envs.point_nd import observed
 
 RADIUS = 0.1  # m
 
@@ -43,13 +44,12 @@ def build_model(maze: Maze, integrator: str) -> mujoco.MjModel:
 class PointMaze(MazeEnv):
     """Reach any point of a maze by pushing; success within 0.3 m.
 
-    State: x, y (m), vx, vy (m/s). Observation: the state and the offset to the desired goal, 6
-    numbers. Achieved goal: x, y.
+    State: x, y (m), vx, vy (m/s). Observation: see `point_nd.observed`. Achieved goal: x, y.
     """
 
     success_radius = 0.3
     act_dim = 2
-    obs_dim = 6
+    own_obs_dim = 6
     model_of = staticmethod(build_model)
     start_state = np.zeros(4)
 
@@ -67,8 +67,7 @@ class PointMaze(MazeEnv):
             self._qvel[some] = xp.where(stopped, 0.0, self._qvel[some])
 
     def observations(self, states: Array, goals: Array, achieved: Array | None = None) -> Array:
-        xp = namespace(states)
-        return xp.asarray(xp.concat([states, goals - states[:, :2]], axis=1), dtype=xp.float32)
+        return observed(self, states, goals)
 
     def achieved_goals(self, states: Array) -> Array:
         return states[:, :2]

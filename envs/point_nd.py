@@ -6,8 +6,8 @@ dimensions, the fewer goals are feasible (20% in two, then 0.06 times that per d
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from goalgan_bt.envs.arrays import Array, namespace
 from goalgan_bt.envs.goal_env import GoalEnv, Ids
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 
@@ -17,11 +17,21 @@ GOAL_RANGE = 5.0  # m, goals are proposed in +- this on every axis
 DT = 0.02  # s
 
 
+def observed(env: GoalEnv, states: Array, goals: Array) -> Array:
+    """What a point sees: its state, the offset to the desired goal and, where there is a heading,
+    the squashed offset along the way; 3 or 4 numbers per dimension."""
+    xp, place = namespace(states), states[:, : env.goal_dim]
+    parts = [states, goals - place]
+    if env.heading is not None:
+        parts.append(env.squashed(env.along(place, goals)))
+    return xp.asarray(xp.concat(parts, axis=1), dtype=xp.float32)
+
+
 class PointND(GoalEnv):
     """Reach any point of the box; success within 0.3 sqrt(dim / 2) m.
 
-    State: positions (m), velocities (m/s). Observation: the state and the offset to the desired
-    goal, 3 dim numbers. Achieved goal: the position.
+    State: positions (m), velocities (m/s). Observation: see `observed`. Achieved goal: the
+    position.
     """
 
     name = "point_nd"
@@ -30,7 +40,7 @@ class PointND(GoalEnv):
     def __init__(self, dim: int, num_envs: int, horizon: int, action_repeat: int) -> None:
         self.bound = np.array(([1.0, 5.0] + [0.3] * dim)[:dim])
         self.success_radius = 0.3 * np.sqrt(dim / 2)
-        self.act_dim, self.obs_dim = dim, 3 * dim
+        self.act_dim, self.own_obs_dim = dim, 3 * dim
         self.start_state = np.zeros(2 * dim)
         self.goal_low, self.goal_high = np.full(dim, -GOAL_RANGE), np.full(dim, GOAL_RANGE)
         super().__init__(num_envs, horizon, action_repeat)
@@ -49,11 +59,8 @@ class PointND(GoalEnv):
             position = np.clip(position + DT * velocity, -self.bound, self.bound)
         self._states[ids] = np.concatenate([position, velocity], axis=1)
 
-    def observations(
-        self, states: FloatArray, goals: FloatArray, achieved: FloatArray | None = None
-    ) -> NDArray[np.float32]:
-        offset = goals - states[:, : self.goal_dim]
-        return np.concatenate([states, offset], axis=1, dtype=np.float32)
+    def observations(self, states: Array, goals: Array, achieved: Array | None = None) -> Array:
+        return observed(self, states, goals)
 
     def achieved_goals(self, states: FloatArray) -> FloatArray:
         return states[:, : self.goal_dim]

@@ -61,8 +61,8 @@ class Player:
         torch.set_num_threads(1)  # the trainer needs the cores
         self._folder = folder
         goals = len(world_of(folder, 1)[1].test_goals())
-        cfg, self.env = world_of(folder, goals)
-        self._policy = GaussianPolicy(self.env.obs_dim, self.env.act_dim, cfg.policy)
+        self._cfg, self.env = world_of(folder, goals)
+        self._policy: GaussianPolicy | None = None
         self._tried: int | None = None  # the checkpoint last looked at, by its time
         self.iteration = 0
         self.rng = np.random.default_rng(seed)
@@ -79,10 +79,10 @@ class Player:
             stamp = os.stat(path).st_mtime_ns
             if stamp != self._tried:
                 self._tried = stamp
-                self.iteration = load_policy(self._policy, self._folder)
+                self._policy, self.iteration = load_policy(self.env, self._cfg, self._folder)
         except (OSError, RunError):
             pass  # none yet, or another version: the last one will do
-        return self.iteration > 0
+        return self._policy is not None
 
     def attempt(self, goals: FloatArray, deterministic: bool = False) -> Attempt:
         """Try each goal once from the start.
@@ -91,6 +91,7 @@ class Player:
             goals: (n, goal_dim) metres, at most as many as there are test goals.
             deterministic: without the policy's noise.
         """
+        assert self._policy is not None, "take_newest() says whether there is a policy"
         env, n = self.env, len(goals)
         seed = int(self.rng.integers(2**31))
         noise = None if deterministic else torch.Generator().manual_seed(seed)

@@ -31,8 +31,9 @@ class Rollouts:
 
     obs: (T, N, obs_dim); actions: (T, N, act_dim) as sampled; rewards, terminated, truncated:
     (T, N); last_obs: (N, obs_dim) what followed the last step; truncated_obs: (K, obs_dim) what
-    followed each truncated step, in the order of np.nonzero(truncated); achieved: (T, N, goal_dim)
-    the goal on which each step ended.
+    followed each truncated step, in the order of np.nonzero(truncated); goals: (T, N, goal_dim)
+    the desired ones; origins, achieved: (T, N, goal_dim) the goals on which each step began and
+    ended.
     """
 
     obs: Float32
@@ -42,6 +43,8 @@ class Rollouts:
     truncated: BoolArray
     last_obs: Float32
     truncated_obs: Float32
+    goals: Float32
+    origins: Float32
     achieved: Float32
 
     def paths(self, n: int) -> Float32:
@@ -123,6 +126,8 @@ class Collector:
         self._obs = self._table(np.float32, env.obs_dim)
         self._sampled = self._table(np.float32, env.act_dim)
         self._rewards = self._table(np.float32)
+        self._goals = self._table(np.float32, env.goal_dim)
+        self._origins = self._table(np.float32, env.goal_dim)
         self._achieved = self._table(np.float32, env.goal_dim)
         self._terminated = self._table(np.bool_)
         self._truncated = self._table(np.bool_)
@@ -155,10 +160,12 @@ class Collector:
         late_goals: list[FloatArray] = [np.empty((0, env.goal_dim))]
         ended: list[tuple[np.ndarray, ...]] = []  # Episodes' columns, with ids before them
         paths: list[tuple[int, Float32, Float32]] = []
+        achieved = env.achieved_goals(env.read_states(ids))
         obs = env.observe(ids)
         for t in range(steps):
             actions = act(obs, noise[t])
             self._obs[t], self._sampled[t] = obs, actions
+            self._goals[t], self._origins[t] = env.goals, achieved
             step = env.step(ids, actions)
             self._actions[self._age, ids] = step.actions
             self._age += 1
@@ -198,6 +205,8 @@ class Collector:
             self._truncated,
             obs,
             env.observations(np.concatenate(late_states), np.concatenate(late_goals)),
+            self._goals,
+            self._origins,
             self._achieved,
         )
         return rollouts, self._episodes(ended, paths)

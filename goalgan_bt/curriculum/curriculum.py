@@ -250,7 +250,12 @@ class GoalCurriculum:
             return self.alp_gmm.sample(n)
         if self.cfg.source == "uniform":
             return self.uniform(n)
-        goals = self.gan.sample(n)
+        goals = self.gan.sample(n * max(1, self.cfg.reject))
+        if self.cfg.reject:
+            mastered = self.estimator(goals) >= self.cfg.r_max
+            far = self.visited.distance_to(goals) > self.cfg.near
+            goals = goals[np.argsort(mastered + 2 * far, kind="stable")[:n]]
+            self.rng.shuffle(goals)
         if k := round(self.cfg.anywhere * n):
             goals[:k] = self.uniform(k)
         return goals
@@ -317,6 +322,8 @@ class GoalCurriculum:
         estimator averages over neighbours, and beside a mastered place there may be a wall.
         """
         near = self.visited.distance_to(goals) <= self.cfg.near
+        if self.cfg.possible:
+            return (success < self.cfg.r_max) & near
         return intermediate(success, self.cfg.r_min, self.cfg.r_max) & near
 
     def _rows(self, goals: ArrayLike | None, name: str) -> FloatArray:

@@ -37,6 +37,10 @@ class GoalsConfig:
     near: Annotated[float, ABOVE_ZERO_OR_INFINITE] = 0.4
     """A goal farther than this from all places where the agent has been is too hard, metres (the
     original: inf). Without it, walls around mastered places look intermediate."""
+    reject: Annotated[int, NOT_NEGATIVE] = 0
+    """Goals imagined for each that is proposed: those called mastered are left out."""
+    possible: bool = False
+    """Labels without lower bound: any place where the agent has been."""
     label_rollouts: Annotated[int, NOT_NEGATIVE] = 0
     """Fresh episodes per goal for its label (the original: 3); 0 takes labels from training."""
     episodes: Annotated[int, ABOVE_ZERO] = 1000

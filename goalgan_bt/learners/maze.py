@@ -56,6 +56,7 @@ def train(cfg: MazeConfig, folder: Path | None, stop: Stop | None = None) -> Tra
     env = make_env(cfg, envs_per_rank(cfg))
     test_env = make_env(cfg, TEST_ENVS)
     learner = MazeLearner(env, cfg)
+    test_env.heading = env.heading
     covered = math.nan
     with session(cfg, folder, learner, env, stop) as run:
         collector = begin(learner, env, test_env, run)
@@ -203,7 +204,9 @@ def propose(learner: MazeLearner, test_env: GoalEnv, run: Session) -> Goals:
     imagined, steps = learner.propose(test_env)
     run.count("label", steps)
     remembered = learner.curriculum.replay.sample(learner.cfg.goals.old, learner.rng)
-    return Goals(np.concatenate([imagined, remembered]), len(imagined))
+    goals = Goals(np.concatenate([imagined, remembered]), len(imagined))
+    learner.places.refresh(goals.all)
+    return goals
 
 
 def practise(learner: MazeLearner, collector: Collector, goals: Goals, run: Session) -> Batch:
@@ -215,6 +218,9 @@ def practise(learner: MazeLearner, collector: Collector, goals: Goals, run: Sess
     with run.clock.measure("learning"):
         run.background.wait("value", "backtracking")
         learner.remember(episodes)
+        learner.places.learn(
+            *(ranks.gather(at.swapaxes(0, 1)) for at in (rollouts.origins, rollouts.achieved))
+        )
         run.background.start("backtracking", learner.fit_model)
     return Batch(rollouts, episodes)
 
@@ -254,8 +260,11 @@ def advantages_and_returns(
         return value(policy.normaliser(torch.from_numpy(raw))).numpy()
 
     values = value(obs).view(rollouts.rewards.T.shape).numpy().T
+    rewards = rollouts.rewards
+    if cfg.places.shaping:
+        rewards = rewards + shaping(learner, rollouts)
     return gae(
-        rollouts.rewards,
+        rewards,
         values,
         rollouts.next_values(values, values_of),
         rollouts.terminated,
@@ -263,6 +272,21 @@ def advantages_and_returns(
         cfg.discount,
         cfg.gae_lambda,
     )
+
+
+def shaping(learner: MazeLearner, rollouts: Rollouts) -> Float32:
+    """Reward for the way that each action has made shorter, (T, N): what is left before less what
+    is left after it (Ng, Harada and Russell 1999, without a discount: with it, standing still far
+    from the goal would pay). None for an action on which the body failed."""
+    cfg, (steps, n, dim) = learner.cfg.places, rollouts.achieved.shape
+    goals = rollouts.goals.reshape(-1, dim)
+
+    def left(places: Float32) -> FloatArray:
+        return learner.places.ways(places.reshape(-1, dim), goals).left.reshape(steps, n)
+
+    shorter = left(rollouts.origins) - left(rollouts.achieved)
+    failed = rollouts.terminated & (rollouts.rewards == 0)
+    return np.where(failed, 0.0, cfg.shaping * shorter).astype(np.float32)
 
 
 def label(

@@ -19,7 +19,7 @@ from goalgan_bt.envs.goal_env import GoalEnv
 from goalgan_bt.envs.maze import Maze
 from goalgan_bt.learners.methods import METHODS
 from goalgan_bt.learners.run_config import RunConfig
-from goalgan_bt.recall.settings import BacktrackingConfig, ImitationConfig, too_much
+from goalgan_bt.recall.settings import BacktrackingConfig, ImitationConfig, PlacesConfig, too_much
 from goalgan_bt.runs.errors import RunError, UsageError
 from goalgan_bt.runs.ranges import ABOVE_ZERO, NOT_NEGATIVE, SHARE, Range, between
 from goalgan_bt.runs.run_folder import maze_of
@@ -77,6 +77,7 @@ class MazeConfig(RunConfig):
     goals: GoalsConfig = field(default_factory=GoalsConfig)
     gan: GanConfig = field(default_factory=GanConfig)
     trpo: TrpoConfig = field(default_factory=TrpoConfig)
+    places: PlacesConfig = field(default_factory=PlacesConfig)
     backtracking: BacktrackingConfig = field(default_factory=BacktrackingConfig)
     imitation: ImitationConfig = field(default_factory=ImitationConfig)
     coverage: CoverageConfig = field(default_factory=CoverageConfig)

@@ -18,20 +18,23 @@ from goalgan_bt.learners.maze_config import MazeConfig
 from goalgan_bt.recall.backtracking import BacktrackingModel
 from goalgan_bt.recall.forward import ForwardModel
 from goalgan_bt.recall.imitation import Imitation
+from goalgan_bt.recall.places import Places
 from goalgan_bt.recall.transitions import Transitions
 from goalgan_bt.runs import checkpoint
+from goalgan_bt.runs.errors import RunError
 
 SESSION = ("iteration", "steps", "seconds", "next_measurement")  # what a `Session` needs to go on
 NOISY = ("rollout", "evaluation", "trpo", "value", "gan", "backtracking", "imitation")
 
 
 class MazeLearner:
-    """The training state, random generators included.
+    """The training state, random generators included. Where the policy goes by a heading, the
+    environment gets it here.
 
     Attributes:
         rng: numpy's generator; noise: torch's, one per part, since parts learn side by side.
-        policy, value, curriculum, transitions, backtracking, imitation: the parts; forward: the one
-            that only a control has, else None.
+        policy, value, curriculum, places, transitions, backtracking, imitation: the parts; forward:
+            the one that only a control has, else None.
         recalls: whether there are recall traces.
     """
 
@@ -45,6 +48,7 @@ class MazeLearner:
             part: torch.Generator().manual_seed(seed)
             for part, seed in zip(NOISY, seeds, strict=True)
         }
+        self.places = recalled_places(env, cfg)
         sizes = env.state_dim, env.act_dim
         self.policy = GaussianPolicy(env.obs_dim, env.act_dim, cfg.policy)
         self.value = ValueFunction(env.obs_dim, cfg.value)
@@ -125,6 +129,7 @@ class MazeLearner:
             "policy": self.policy,
             "value": self.value,
             "curriculum": self.curriculum,
+            "places": self.places,
             "transitions": self.transitions,
             "backtracking": self.backtracking,
             "imitation": self.imitation,
@@ -167,16 +172,36 @@ def load(learner: MazeLearner, folder: Path) -> dict[str, Any]:
     return run
 
 
-def load_policy(policy: GaussianPolicy, folder: Path) -> int:
-    """Put only the policy of a run's `checkpoint.pt` into one of the same settings.
+def load_policy(env: GoalEnv, cfg: MazeConfig, folder: Path) -> tuple[GaussianPolicy, int]:
+    """The policy of a run's `checkpoint.pt`, and to the environment the heading that it goes by.
+
+    Args:
+        env: where it will act.
+        cfg: the run's settings.
+        folder: the run folder.
 
     Returns:
-        The iteration that made it.
+        The policy, and the iteration that made it.
 
     Raises:
-        RunError: as `load`.
+        RunError: as `load`; the environment is left as it was.
     """
-    with checkpoint.saved(folder) as state:
-        policy.load_state_dict(state["learner"]["policy"])
-        iteration = int(state["run"]["iteration"])
-    return iteration
+    before = env.heading
+    places = recalled_places(env, cfg)
+    try:
+        policy = GaussianPolicy(env.obs_dim, env.act_dim, cfg.policy)
+        with checkpoint.saved(folder) as state:
+            places.load_state_dict(state["learner"]["places"])
+            policy.load_state_dict(state["learner"]["policy"])
+            iteration = int(state["run"]["iteration"])
+    except RunError:
+        env.heading = before
+        raise
+    return policy, iteration
+
+
+def recalled_places(env: GoalEnv, cfg: MazeConfig) -> Places:
+    """Places for an environment, which gets their heading if the settings say so."""
+    places = Places(env.goal_low, env.goal_high, env.success_radius, cfg.places)
+    env.heading = places.heading if cfg.places.heading else None
+    return places

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from goalgan_bt.agent.policy import Actor, GaussianPolicy
+from goalgan_bt.agent.policy import Actor
 from goalgan_bt.envs.goal_env import GoalEnv
 from goalgan_bt.learners import maze_learner
 from goalgan_bt.learners.maze_config import MazeConfig, make_env
@@ -52,8 +52,7 @@ class TrainedPolicy:
     def __init__(self, folder: Path | str, seed: int = 0) -> None:
         folder = Path(folder)
         cfg, self.env = world_of(folder, 1)
-        policy = GaussianPolicy(self.env.obs_dim, self.env.act_dim, cfg.policy)
-        self.iteration = maze_learner.load_policy(policy, folder)
+        policy, self.iteration = maze_learner.load_policy(self.env, cfg, folder)
         self._act = Actor(policy)
         self._noise = torch.Generator().manual_seed(seed)
 

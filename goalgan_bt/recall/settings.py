@@ -78,6 +78,30 @@ class ImitationConfig:
 
 
 @dataclass(frozen=True)
+class PlacesConfig:
+    """The backtracking model over places, and its two uses."""
+
+    shaping: Annotated[float, NOT_NEGATIVE] = 1.0
+    """Reward for each metre by which the way that is left gets shorter, beside the true reward; 0
+    is off. Labels and coverage never see it."""
+    heading: bool = True
+    """Tell the policy the direction in which the way gets shorter, beside that of the goal."""
+    way: Literal["recalled", "straight"] = "recalled"
+    """The way that is left: recalled from the moves made, or the straight line (a control)."""
+    cell: Annotated[float, ABOVE_ZERO] = 0.25
+    """Distance between two places, metres."""
+    reach: Annotated[float, ABOVE_ZERO] = 0.6
+    """Length of a move at most, metres."""
+    lags: Annotated[tuple[int, ...], ABOVE_ZERO] = (1, 2, 5, 10, 20)
+    """Actions that a move takes."""
+    both_ways: bool = True
+    """Whether a move that was made can be made the other way."""
+    forget: Annotated[float, NOT_NEGATIVE] = 0.0
+    """After so many actions from where a move begins it counts half as much, and less than half a
+    move is forgotten: one that works no longer; 0 forgets none."""
+
+
+@dataclass(frozen=True)
 class RecallConfig:
     """Recall traces beside an agent of Stable-Baselines3: what is recalled, how it is imitated."""
 

@@ -1,0 +1,273 @@
+"""A backtracking model over places: from which places has the agent come to this one?
+
+The paper's q(s_t | s_t+1) (Recall Traces, section 2.1) over places instead of full states, by
+counting, as it counts in four rooms: a place is a point of a lattice in the goal space, and counted
+are the moves from place to place that the agent has made. Unrolled backward from a goal, along the
+shortest moves, it tells for every place that the agent has been to the way that is left to that
+goal, and the direction in which it gets shorter. A body that loses energy in contacts cannot be
+unrolled backward over its full states for long; over places it can, all the way to the start.
+
+The way that is left is a potential of the agent's own making (Ng, Harada and Russell 1999), and the
+direction a part of what the policy sees: the two uses of it in `PlacesConfig`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from goalgan_bt.envs.maze import FloatArray
+from goalgan_bt.recall.settings import PlacesConfig
+
+Nodes = NDArray[np.int64]  # places by number, in the order in which they were found
+NEAR = 1.2  # success radii: a goal in sight and as near as that is where one sees it
+ONCE = 0.5  # moves that count for less are forgotten
+
+
+class Ways(NamedTuple):
+    """left: (n,) the way that is left, metres; directions: (n, goal_dim) in which it gets shorter,
+    of length 1, or 0 on the goal."""
+
+    left: FloatArray
+    directions: FloatArray
+
+
+class Places:
+    """Where the agent has been, the moves that it made, and the ways that they add up to.
+
+    Args:
+        low, high: (goal_dim,) the box of the goals, metres.
+        success_radius: metres.
+        cfg: settings.
+
+    Attributes:
+        places: (K, goal_dim) the places visited; moves: (K, K) how often each move was made.
+    """
+
+    def __init__(
+        self, low: FloatArray, high: FloatArray, success_radius: float, cfg: PlacesConfig
+    ) -> None:
+        self.cfg, self._low, self._high = cfg, np.asarray(low, float), np.asarray(high, float)
+        self._near = NEAR * success_radius
+        # A point of the lattice has a number, its key; a step along axis i adds strides[i] to it.
+        self._sides = np.ceil((self._high - self._low) / cfg.cell).astype(np.int64) + 2
+        self._strides = np.concatenate([[1], np.cumprod(self._sides[:-1])])
+        self._take(np.empty(0, np.int64), csr_array((0, 0)))
+        self.refresh()
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def learn(self, origins: FloatArray, ends: FloatArray) -> None:
+        """Count the moves of n simulations in T actions each. Ways know of them after `refresh`.
+
+        Args:
+            origins, ends: (n, T, goal_dim) where each action began and ended. Where one begins
+                elsewhere than the last one ended, another episode has begun.
+        """
+        self._visit(np.concatenate([origins, ends]).reshape(-1, len(self._low)))
+        begun, ended = self._find(self._keys_of(origins)), self._find(self._keys_of(ends))
+        episode = np.zeros(begun.shape, np.int64)
+        episode[:, 1:] = (origins[:, 1:] != ends[:, :-1]).any(axis=2).cumsum(axis=1)
+        made = [np.empty((2, 0), np.int64)]
+        for lag in self.cfg.lags:
+            first, last = slice(max(0, begun.shape[1] - lag + 1)), slice(lag - 1, None)
+            squared = np.square(ends[:, last] - origins[:, first]).sum(axis=2)
+            move = (squared <= self.cfg.reach**2) & (episode[:, first] == episode[:, last])
+            move &= begun[:, first] != ended[:, last]
+            made.append(np.stack([begun[:, first][move], ended[:, last][move]]))
+        a, b = np.concatenate(made, axis=1)
+        k = len(self)
+        self.moves.resize((k, k))
+        if self.cfg.forget:
+            actions = np.bincount(begun.ravel(), minlength=k)
+            self.moves = csr_array(diags_array(np.exp2(-actions / self.cfg.forget)) @ self.moves)
+            self.moves.data[self.moves.data < ONCE] = 0.0
+            self.moves.eliminate_zeros()
+        self.moves = csr_array(self.moves + csr_array((np.ones(len(a)), (a, b)), shape=(k, k)))
+
+    def refresh(self, goals: FloatArray | None = None) -> None:
+        """Let ways go along all moves that were counted.
+
+        Args:
+            goals: (n, goal_dim) to which ways will be asked for: searching them at once is faster.
+        """
+        k, dim = self.places.shape
+        a, b = self.moves.nonzero()
+        length = np.sqrt(np.square(self.places[b] - self.places[a]).sum(axis=1))
+        made = csr_array((length, (a, b)), shape=(k, k))
+        either = csr_array(made.maximum(made.T))
+        self._costs = either if self.cfg.both_ways else made
+        self._slopes = slopes(self.places, either)
+        self._tree = cKDTree(self.places)
+        # For some goals (rows) at every place (columns): 1, the way that is left, its direction; all
+        # zero where no way is known, as at the last place, which is none.
+        self._table = np.zeros((0, k + 1, 2 + dim), np.float32)
+        self._row = np.full(k, -1)  # by the place nearest to the goal
+        self._asked, self._rows = np.empty(0, np.int64), np.empty(0, np.int64)  # by a goal's key
+        self._last: tuple[tuple[FloatArray, FloatArray], FloatArray] | None = None
+        if goals is not None and len(a):
+            self._rows_of(goals)
+
+    def ways(self, places: FloatArray, goals: FloatArray) -> Ways:
+        """The ways from places to goals, both (n, goal_dim): those recalled, to and from the
+        nearest places visited, and straight lines as long as nothing is known."""
+        offsets = goals - places
+        straight = np.sqrt(np.square(offsets).sum(axis=1))
+        direct = offsets / np.maximum(straight, 1e-9)[:, None]
+        if self.cfg.way == "straight" or not self._costs.nnz or not len(places):
+            return Ways(straight, direct)
+        rows = self._rows_of(goals)
+        corners, weights = self._around(places)
+        np.minimum(corners, self._table.shape[1] - 1, out=corners)  # new since the last refresh
+        mean = np.einsum("nc,ncf->nf", weights, self._table[rows[:, None], corners])
+        if (lost := mean[:, 0] < 1e-6).any():
+            away, nearest = self._tree.query(np.nan_to_num(places[lost]))
+            mean[lost] = self._table[rows[lost], nearest]
+            mean[lost, 1] += away
+        left = mean[:, 1] / np.maximum(mean[:, 0], 1e-9)
+        length = np.sqrt(np.square(mean[:, 2:]).sum(axis=1))
+        as_seen = (straight < self._near) & (left < 1.5 * straight + 2 * self.cfg.cell)
+        as_seen |= ~(length > 1e-6)  # as where no way leads
+        left = np.where(as_seen, straight, left)
+        directions = mean[:, 2:] / np.maximum(length, 1e-6)[:, None]
+        return Ways(left, np.where(as_seen[:, None], direct, directions))
+
+    def heading(self, places: FloatArray, goals: FloatArray) -> FloatArray:
+        """Offsets from places to goals, (n, goal_dim) each, along the way: as far as the way is
+        long, in the direction in which it begins."""
+        asked = places, goals
+        if self._last is None or not all(map(np.array_equal, asked, self._last[0])):
+            ways = self.ways(places, goals)
+            offsets = ways.directions * ways.left[:, None]
+            self._last = (np.copy(places), np.copy(goals)), offsets
+        # The Ant asks twice: for what it sees, and for which of its legs is which.
+        return self._last[1].copy()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The places and the moves; ways follow from them."""
+        moves = self.moves.tocoo()
+        columns = {"keys": self._keys, "from": moves.row, "to": moves.col, "count": moves.data}
+        return {name: torch.from_numpy(np.asarray(column)) for name, column in columns.items()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take over what `state_dict` gave, and refresh.
+
+        Raises:
+            ValueError: if those are no places and moves.
+        """
+        keys, a, b, count = (state[name].numpy() for name in ("keys", "from", "to", "count"))
+        if len(np.unique(keys)) < len(keys) or (keys // self._sides.prod()).any():
+            raise ValueError("places visited are none of its lattice")
+        if not np.isfinite(count).all():
+            raise ValueError("a count of moves is not finite")
+        self._take(keys.astype(np.int64), csr_array((count, (a, b)), shape=(len(keys),) * 2))
+        self.refresh()
+
+    # The lattice.
+
+    def _take(self, keys: Nodes, moves: csr_array) -> None:
+        self._keys = keys
+        self._order = np.argsort(keys)
+        self._sorted = keys[self._order]
+        self.places = self._points(keys)
+        self.moves = moves
+
+    def _visit(self, points: FloatArray) -> None:
+        """Give the places nearest to points (n, goal_dim) numbers, if they have none."""
+        there = points[np.isfinite(points).all(axis=1)]  # a diverged body is nowhere
+        new = np.setdiff1d(self._keys_of(there), self._keys)
+        if len(new):
+            self._take(np.concatenate([self._keys, new]), self.moves)
+
+    def _on_lattice(self, points: FloatArray) -> FloatArray:
+        """Points (..., goal_dim) in units of the lattice, those outside of the box on its rim."""
+        return (np.fmin(np.fmax(points, self._low), self._high) - self._low) / self.cfg.cell
+
+    def _keys_of(self, points: FloatArray) -> Nodes:
+        """Keys of the places nearest to points, (..., goal_dim) -> (...)."""
+        return np.asarray(np.rint(self._on_lattice(points)).astype(np.int64) @ self._strides)
+
+    def _points(self, keys: Nodes) -> FloatArray:
+        """Where they are, (n,) -> (n, goal_dim)."""
+        return self._low + self.cfg.cell * (keys[:, None] // self._strides % self._sides)
+
+    def _find(self, keys: Nodes) -> Nodes:
+        """Numbers of the places with those keys, -1 for those never visited."""
+        if not len(self._keys):
+            return np.full(keys.shape, -1)
+        at = np.minimum(np.searchsorted(self._sorted, keys), len(self._keys) - 1)
+        return np.where(self._sorted[at] == keys, self._order[at], -1)
+
+    def _around(self, points: FloatArray) -> tuple[Nodes, FloatArray]:
+        """Points (n, goal_dim) as weighted means of the corners of Kuhn's simplex around each (as
+        Davies 1997 interpolates), goal_dim + 1 of them, not all of which were visited.
+
+        Returns:
+            Their numbers and their weights, each (n, goal_dim + 1).
+        """
+        x = self._on_lattice(points)
+        first = x.astype(np.int64)
+        order = np.argsort(first - x, axis=1)  # the axis along which it is farthest comes first
+        weights = np.ones((len(x), x.shape[1] + 1))
+        weights[:, 1:] = np.take_along_axis(x - first, order, axis=1)
+        weights[:, :-1] -= weights[:, 1:]
+        keys = np.zeros(weights.shape, np.int64)
+        keys[:, 1:] = self._strides[order].cumsum(axis=1)
+        return self._find(keys + (first @ self._strides)[:, None]), weights
+
+    # The ways.
+
+    def _rows_of(self, goals: FloatArray) -> Nodes:
+        """Rows of the table for goals, (n, goal_dim) -> (n,): those of the nearest places visited.
+        Which are missing are made."""
+        keys = self._keys_of(goals)
+        at = np.minimum(np.searchsorted(self._asked, keys), len(self._asked) - 1)
+        if not len(self._asked) or (self._asked[at] != keys).any():
+            self._asked = np.union1d(self._asked, keys)
+            nearest = self._tree.query(self._points(self._asked))[1]
+            self._search(np.unique(nearest[self._row[nearest] < 0]))
+            self._rows = self._row[nearest]
+            at = np.searchsorted(self._asked, keys)
+        return self._rows[at]
+
+    def _search(self, ends: Nodes) -> None:
+        """Unroll the moves backward from those places, and put what comes of it into the table."""
+        if not len(ends):
+            return
+        left = dijkstra(self._costs.T, indices=ends)
+        with np.errstate(invalid="ignore"):
+            down = np.stack([-(slope @ left.T).T for slope in self._slopes], axis=2)
+            down /= np.maximum(np.sqrt(np.square(down).sum(axis=2, keepdims=True)), 1e-9)
+        new = np.zeros((len(ends), *self._table.shape[1:]), np.float32)
+        new[:, :-1, 0], new[:, :-1, 1], new[:, :-1, 2:] = 1.0, left, down
+        new[~np.isfinite(new).all(axis=2)] = 0.0  # no way leads there, or to a neighbour
+        self._row[ends] = len(self._table) + np.arange(len(ends))
+        self._table = np.concatenate([self._table, new])
+
+
+def slopes(places: FloatArray, neighbours: csr_array) -> list[csr_array]:
+    """What takes numbers at places to the slope of the plane through them and their neighbours'
+    (least squares), a sparse matrix (K, K) for each axis.
+
+    Args:
+        places: (K, goal_dim).
+        neighbours: (K, K), symmetric, not zero where two are neighbours.
+    """
+    k, dim = places.shape
+    a, b = neighbours.nonzero()
+    steps = places[b] - places[a]
+    spread = np.zeros((k, dim, dim))
+    np.add.at(spread, a, steps[:, :, None] * steps[:, None, :])
+    spread += 1e-6 * np.eye(dim)  # neighbours in a row have a slope along it only
+    weights = np.linalg.solve(spread[a], steps[:, :, None])[:, :, 0]
+    matrices = []
+    for column in weights.T:
+        rise = csr_array((column, (a, b)), shape=(k, k))
+        matrices.append(csr_array(rise - diags_array(rise.sum(axis=1))))
+    return matrices

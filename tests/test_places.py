@@ -1,0 +1,222 @@
+"""Recall over places: the ways left are those that were walked, however the walks were made."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from goalgan_bt.recall.places import Places
+from goalgan_bt.recall.settings import PlacesConfig
+
+LOW, HIGH = np.array([-2.0, -2.0]), np.array([6.0, 6.0])
+CFG = PlacesConfig()
+
+
+def walked(*paths, cfg=CFG, radius=0.3, low=LOW, high=HIGH):
+    """Places after walks, each (n, dim) points, one action from point to point."""
+    places = Places(low, high, radius, cfg)
+    for path in paths:
+        path = np.asarray(path, dtype=float)
+        places.learn(path[None, :-1], path[None, 1:])
+    places.refresh()
+    return places
+
+
+def line(*corners, step=0.1):
+    """A walk along straight lines."""
+    parts = [np.array(corners[:1], float)]
+    for a, b in zip(corners[:-1], corners[1:], strict=True):
+        a, b = np.array(a, float), np.array(b, float)
+        n = max(1, round(np.linalg.norm(b - a) / step))
+        parts.append(a + (b - a) * np.arange(1, n + 1)[:, None] / n)
+    return np.concatenate(parts)
+
+
+def way(places, start, goal):
+    ways = places.ways(np.array([start], float), np.array([goal], float))
+    return float(ways.left[0]), ways.directions[0]
+
+
+U = line((0, 0), (4, 0), (4, 2), (0, 2))  # around a wall at y = 1 that nobody crossed
+
+
+def test_before_anything_is_known_ways_are_straight_lines():
+    places = Places(LOW, HIGH, 0.3, CFG)
+    left, direction = way(places, (0, 0), (3, 4))
+    assert left == pytest.approx(5) and direction == pytest.approx([0.6, 0.8])
+    assert places.heading(np.zeros((1, 2)), np.array([[3.0, 4.0]])) == pytest.approx(
+        np.array([[3.0, 4.0]])
+    )
+
+
+def test_no_way_crosses_a_wall_that_nobody_crossed():
+    left, direction = way(walked(U), (0, 0), (0, 2))
+    assert left == pytest.approx(10, rel=0.1)  # 4 + 2 + 4 m, corners cut by a lattice step
+    assert direction @ (1, 0) > 0.98  # away from the goal, which is straight up
+
+
+@pytest.mark.parametrize("x", [0.5, 1.3, 2.0, 3.2])
+def test_one_action_of_progress_shows(x):
+    places = walked(U)
+    before, _ = way(places, (x, 0.0), (0, 2))
+    after, _ = way(places, (x + 0.05, 0.0), (0, 2))
+    assert before - after == pytest.approx(0.05, abs=0.01)
+
+
+def test_a_move_made_one_way_only_is_not_assumed_the_other_way_where_the_setting_says_so():
+    forth = replace(CFG, both_ways=False)
+    assert way(walked(U), (0, 2), (0, 0))[0] == pytest.approx(10, rel=0.1)
+    one_way = walked(U, cfg=forth)
+    assert way(one_way, (0, 0), (0, 2))[0] == pytest.approx(10, rel=0.1)
+    assert way(one_way, (0, 2), (0, 0))[0] == pytest.approx(2)  # unknown: the straight line
+    both = walked(U, U[::-1], cfg=forth)
+    assert way(both, (0, 2), (0, 0))[0] == pytest.approx(10, rel=0.1)
+
+
+def test_the_beginning_of_another_episode_is_no_move():
+    """A body that is put elsewhere has not gone there, however near it is."""
+    origins = np.array([[[0.0, 0.0], [0.5, 0.5], [1.0, 0.5]]])
+    ends = np.array([[[0.0, 0.1], [1.0, 0.5], [1.5, 0.5]]])
+    places = Places(LOW, HIGH, 0.3, CFG)
+    places.learn(origins, ends)
+    made = {
+        (tuple(places.places[a]), tuple(places.places[b]))
+        for a, b in zip(*places.moves.nonzero(), strict=True)
+    }
+    assert made == {((0.5, 0.5), (1.0, 0.5)), ((1.0, 0.5), (1.5, 0.5))}
+
+
+def test_what_is_farther_than_the_reach_is_no_move():
+    assert walked([(0, 0), (0, 0.5)]).moves.nnz == 1
+    assert walked([(0, 0), (0, 0.7)]).moves.nnz == 0
+
+
+def test_moves_are_counted():
+    places = walked([(0, 0), (0.5, 0), (0, 0), (0.5, 0)], cfg=replace(CFG, lags=(1,)))
+    first, second = (
+        int(np.flatnonzero((places.places == p).all(axis=1))[0]) for p in [(0, 0), (0.5, 0)]
+    )
+    assert places.moves[first, second] == 2 and places.moves[second, first] == 1
+
+
+def test_a_move_that_works_no_longer_is_forgotten_and_one_that_is_made_is_not():
+    cfg = replace(CFG, forget=100.0)
+    shut, open_ = line((0, 0), (0, 2)), line((0, 0), (2, 0), (2, 2), (0, 2))
+    places = walked(shut, open_, cfg=cfg)
+    assert way(places, (0, 0), (0, 2))[0] == pytest.approx(2, abs=0.2)
+    for _ in range(200):  # the way up is shut: pushing there leads nowhere
+        tried = line((0, 0), (0, 0.9), (0, 0))
+        places.learn(tried[None, :-1], tried[None, 1:])
+        for y in (1.0, 1.25, 1.5, 1.75):
+            stuck = np.tile((0.0, y), (1, 20, 1))
+            places.learn(stuck, stuck)
+        places.learn(open_[None, :-1], open_[None, 1:])
+    places.refresh()
+    assert way(places, (0, 0), (0, 2))[0] == pytest.approx(6, rel=0.1)
+    assert way(walked(*[shut, open_] * 200), (0, 0), (0, 2))[0] == pytest.approx(2, abs=0.2)
+
+
+def test_goals_that_nobody_visited_are_reached_by_the_nearest_place():
+    left, direction = way(walked(U), (0, 0), (-1, 3))
+    assert left == pytest.approx(10, rel=0.1) and direction @ (1, 0) > 0.98
+
+
+def test_a_goal_in_sight_is_where_one_sees_it_and_one_behind_a_wall_is_not():
+    places = walked(line((0, 0), (3, 0), (3, 0.75), (0, 0.75)), radius=1.0)
+    assert way(places, (0.0, 0.0), (0.9, 0.0))[0] == pytest.approx(0.9)
+    behind, direction = way(places, (0.0, 0.0), (0.0, 0.75))  # 0.75 m off, 6.75 m to walk
+    assert behind > 6 and direction @ (1, 0) > 0.9
+
+
+def everywhere(low, high, n, step, rng):
+    """n random walks in a box."""
+    dim = len(low)
+    at, paths = rng.uniform(low, high, (n, dim)), []
+    for _ in range(60):
+        paths.append(at)
+        at = np.clip(at + rng.normal(0, step, (n, dim)), low, high)
+    return np.stack(paths, axis=1)
+
+
+@pytest.mark.parametrize(("dim", "n", "cell"), [(2, 300, 0.25), (3, 1000, 0.4), (6, 800, 0.5)])
+def test_in_the_open_ways_are_nearly_straight_in_any_dimension(dim, n, cell):
+    rng = np.random.default_rng(0)
+    low, high = -np.ones(dim), np.array([2.0, 2.0, 2.0, -0.5, -0.5, -0.5][:dim])
+    paths = everywhere(low, high, n, 0.12, rng)
+    cfg = replace(CFG, cell=cell, reach=2.4 * cell)
+    places = Places(low, high, 0.3, cfg)
+    places.learn(paths[:, :-1], paths[:, 1:])
+    places.refresh()
+    at, goals = rng.uniform(low, high, (2, 200, dim))
+    left, directions = places.ways(at, goals)
+    straight = np.linalg.norm(goals - at, axis=1)
+    far = straight > 1.0
+    assert np.median(left[far] / straight[far]) < 1.25
+    cosines = (directions * (goals - at)).sum(axis=1) / straight
+    assert np.median(cosines[far]) > 0.9
+
+
+def test_saved_and_loaded_they_answer_the_same():
+    rng = np.random.default_rng(1)
+    places = walked(U, everywhere(np.array([0, 2]), np.array([2, 4]), 3, 0.1, rng)[0])
+    other = Places(LOW, HIGH, 0.3, CFG)
+    other.load_state_dict(places.state_dict())
+    at, goals = rng.uniform(LOW, HIGH, (2, 100, 2))
+    for mine, its in zip(places.ways(at, goals), other.ways(at, goals), strict=True):
+        assert np.array_equal(mine, its)
+    for each in (places, other):  # and go on learning the same
+        each.learn(U[None, 1:], U[None, :-1])
+        each.refresh(goals)
+    assert np.array_equal(places.heading(at, goals), other.heading(at, goals))
+
+
+def test_no_places_are_saved_too():
+    other = Places(LOW, HIGH, 0.3, CFG)
+    other.load_state_dict(Places(LOW, HIGH, 0.3, CFG).state_dict())
+    assert len(other) == 0 and way(other, (0, 0), (3, 4))[0] == pytest.approx(5)
+
+
+def test_what_is_no_state_of_places_is_refused():
+    state = walked(U).state_dict()
+    with pytest.raises(ValueError, match="lattice"):
+        Places(LOW, HIGH, 0.3, CFG).load_state_dict(state | {"keys": state["keys"] - 10**6})
+    with pytest.raises(ValueError):
+        Places(LOW, HIGH, 0.3, CFG).load_state_dict(state | {"from": state["from"] + 10**6})
+    with pytest.raises(ValueError, match="finite"):
+        count = torch.full_like(state["count"], torch.nan)
+        Places(LOW, HIGH, 0.3, CFG).load_state_dict(state | {"count": count})
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    cell=st.floats(0.1, 1.0),
+    both=st.booleans(),
+    dim=st.integers(1, 4),
+)
+def test_whatever_was_walked_ways_are_finite_and_directions_of_length_one(seed, cell, both, dim):
+    rng = np.random.default_rng(seed)
+    low, high = np.full(dim, -2.0), np.full(dim, 3.0)
+    cfg = replace(CFG, cell=cell, reach=2.5 * cell, both_ways=both, forget=rng.choice([0.0, 50.0]))
+    places = Places(low, high, 0.3, cfg)
+    paths = everywhere(low * 1.3, high * 1.3, 4, 0.3, rng)  # out of the box, too
+    paths[rng.random(paths.shape) < 0.02] = rng.choice([np.nan, np.inf])
+    places.learn(paths[:, :-1], paths[:, 1:])
+    places.refresh()
+    at, goals = rng.uniform(2 * low, 2 * high, (2, 50, dim))
+    left, directions = places.ways(at, goals)
+    assert np.isfinite(left).all() and (left >= 0).all()
+    assert np.linalg.norm(directions, axis=1) == pytest.approx(1, abs=1e-5)
+    assert np.isfinite(places.heading(at, goals)).all()
+    assert (places.ways(goals, goals).left == 0).all()
+
+
+def test_as_many_answers_as_questions():
+    places = walked(U)
+    assert places.heading(np.empty((0, 2)), np.empty((0, 2))).shape == (0, 2)
+    twice = places.heading(U, U[::-1].copy())
+    twice[:] = 99.0  # whoever gets an answer may change it
+    assert not (places.heading(U, U[::-1].copy()) == 99.0).any()
