@@ -22,6 +22,7 @@ from goalgan_bt.agent.policy import Actor
 from goalgan_bt.learners import table
 from goalgan_bt.learners.maze import TEST_ENVS
 from goalgan_bt.learners.maze_config import make_env
+from goalgan_bt.learners.maze_learner import load_policy
 from goalgan_bt.runs.command_line import parse
 from goalgan_bt.runs.errors import RunError, UsageError
 from goalgan_bt.runs.terminal import complain
@@ -52,9 +53,8 @@ def integrators(folder: Path, rollouts: int) -> dict[str, float]:
     for integrator in ("implicitfast", "rk4"):
         env = make_env(replace(cfg, integrator=integrator), TEST_ENVS)
         noise = torch.Generator().manual_seed(cfg.seed)
-        measured = coverage(
-            env, load_policy(env, cfg, folder)[0], env.test_goals(), rollouts, noise
-        )
+        policy, _ = load_policy(env, cfg, folder)
+        measured = coverage(env, policy, env.test_goals(), rollouts, noise)
         found[integrator] = float(measured.stochastic.mean())
         found[f"{integrator}_deterministic"] = float(measured.deterministic.mean())
     return found
@@ -69,7 +69,8 @@ def in_gymnasium(folder: Path, episodes: int) -> dict[str, float]:
     cfg = table.load(folder)
     ours = make_env(cfg, 1)
     theirs = gymnasium.make("PointMaze_UMaze-v3", continuing_task=False)
-    act, successes = Actor(load_policy(ours, cfg, folder)[0]), np.zeros((len(CELLS), episodes))
+    policy, _ = load_policy(ours, cfg, folder)
+    act, successes = Actor(policy), np.zeros((len(CELLS), episodes))
     for i, cell in enumerate(CELLS):
         for episode in range(episodes):
             options = {"reset_cell": np.array(START), "goal_cell": np.array(cell)}

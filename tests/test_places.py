@@ -1,5 +1,6 @@
 """Recall over places: the ways left are those that were walked, however the walks were made."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -28,7 +29,7 @@ def walked(*paths, cfg=CFG, radius=0.3, low=LOW, high=HIGH):
 def line(*corners, step=0.1):
     """A walk along straight lines."""
     parts = [np.array(corners[:1], float)]
-    for a, b in zip(corners[:-1], corners[1:], strict=True):
+    for a, b in itertools.pairwise(corners):
         a, b = np.array(a, float), np.array(b, float)
         n = max(1, round(np.linalg.norm(b - a) / step))
         parts.append(a + (b - a) * np.arange(1, n + 1)[:, None] / n)

@@ -68,6 +68,15 @@ PLOTS = (
         share=True,
     ),
     Plot(
+        "Recall traces still valid so many steps before the goal",
+        tuple((f"backtracking/valid_{n}", str(n)) for n in (10, 20, 50)),
+        share=True,
+    ),
+    Plot(
+        "Reward per action",
+        (("rollout/reward", "true"), ("rollout/shaping", "shaping by places")),
+    ),
+    Plot(
         "Recall traces, metres per action",
         (
             ("backtracking/moved", "length of a step"),

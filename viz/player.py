@@ -106,6 +106,15 @@ class Player:
             fell[active] = step.terminated & (step.rewards == 0)
         return Attempt(goals, np.array(states), ends, reached, fell, env.dt * env.action_repeat)
 
+    def ways(self, goal: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Which way leads to a goal, (1, goal_dim), from each test goal: those places, and
+        directions of length 1, (K, goal_dim) each. None where the policy goes by no heading."""
+        places = self.env.test_goals()
+        if self.env.heading is None:
+            return places[:0], places[:0]
+        along = self.env.heading(places, np.repeat(goal, len(places), axis=0))
+        return places, along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+
     def some_goal(self) -> FloatArray:
         """A feasible goal at random, (1, goal_dim)."""
         return self.rng.choice(self.env.test_goals(), size=1)

@@ -24,10 +24,11 @@ TOO_HARD, INTERMEDIATE, TOO_EASY, REPLAYED = (
     (120, 120, 120),
 )
 TRACE, OLD_TRACE = (255, 150, 0), (25, 12, 12)  # at the goal, and farthest back
-PATH, MARK = (90, 90, 100), (255, 0, 170)
+PATH, WAY, MARK = (90, 90, 100), (20, 20, 25), (255, 0, 170)
 WALL, FLOOR, START = (105, 110, 120), (45, 48, 54), (255, 255, 255)
 FAR_BELOW = np.full((1, 1, 3), -100, dtype=np.float32)  # where a layer with nothing in it is
 PIXELS = 16  # per tile of the coverage map
+ARROW = 0.32  # metres
 WALL_HEIGHT = 0.35  # metres: low, so that no wall hides the map
 
 # name: (label in the panel, what one is looking at, shown at first)
@@ -47,6 +48,12 @@ LAYERS = {
     "traces": (
         "Recall traces",
         "Imagined by the backtracking model: bright at the goal, fading backward in time.",
+        True,
+    ),
+    "ways": (
+        "Recalled ways",
+        "Which way leads from each place to the goal that the body goes for, as the backtracking "
+        "model over places recalls it. The policy sees that direction.",
         True,
     ),
     "paths": ("Paths", "Where some of the last training episodes went.", False),
@@ -108,6 +115,21 @@ def segments(lines: FloatArray) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
     step = np.broadcast_to(np.arange(max(len(lines) - 1, 0))[:, None], both.shape[:2])
     whole = np.isfinite(both).all(axis=(2, 3))
     return both[whole], step[whole]
+
+
+def arrows(places: FloatArray, directions: FloatArray) -> NDArray[np.float32]:
+    """Arrows with their middle on places as segments, (3 n, 2, 3).
+
+    Args:
+        places: (n, goal_dim) metres.
+        directions: (n, goal_dim); an arrow is as long as it is here, times `ARROW`.
+    """
+    ahead = ARROW * np.asarray(directions, dtype=float)[:, :2]
+    left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+    tip = np.asarray(places, dtype=float)[:, :2] + ahead / 2
+    tails = tip - ahead, tip - 0.35 * ahead + 0.2 * left, tip - 0.35 * ahead - 0.2 * left
+    lines = [np.stack([tail, tip], axis=1) for tail in tails]
+    return on_floor(np.concatenate(lines), 0.04)
 
 
 def drawn(maze: Maze | None, box: FloatArray) -> FloatArray:
@@ -185,6 +207,11 @@ class Scene:
         few = goals[:1, None, :2] if len(goals) == 1 else np.empty((0, 1, 2))
         points, _ = segments(np.swapaxes(few + circle, 0, 1))
         self._lines("body", points, MARK, 3.0, "goal")
+
+    def draw_ways(self, places: FloatArray, directions: FloatArray) -> None:
+        """Draw a field of arrows: where, and in which directions of length 1, each (n, goal_dim);
+        none clear it."""
+        self._lines("ways", arrows(places, directions), WAY, 1.5)
 
     def _name(self, layer: str, node: str = "node") -> str:
         return f"{self._prefix}/{layer}/{node}"

@@ -208,6 +208,8 @@ class View:
         self._attempt = self._player.attempt(goals)
         self._attempt_began = time.monotonic()
         self._scenes[0].mark(goals, self._player.env.success_radius)
+        one = len(goals) == 1  # no field leads to all of them
+        self._scenes[0].draw_ways(*self._player.ways(goals) if one else (goals[:0], goals[:0]))
 
     def _serve_all(self, now: float) -> None:
         attempt = None

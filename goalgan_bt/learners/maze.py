@@ -40,6 +40,7 @@ ANYWHERE = 1000  # goals of the first batch, uniform in the box
 FRAME_TRACES = 64  # traces kept in a frame
 FRAME_PATHS = 32  # simulations whose paths are kept in a frame
 SEED_STATES = 2000  # experienced states among which the decoder looks
+DEPTHS = 10, 20, 50  # steps before the goal at which it is told how many traces still are valid
 KL_SAMPLE = 1024  # observations on which imitation's KL is bounded
 
 
@@ -235,23 +236,27 @@ def improve(learner: MazeLearner, batch: Batch, run: Session) -> Tensor:
     policy, rollouts, noise = learner.policy, batch.rollouts, learner.noise
     with run.clock.measure("learning"):
         obs = policy.normaliser(flat(rollouts.obs))
-        advantages, returns = advantages_and_returns(learner, rollouts, obs)
+        shaped = shaping(learner, rollouts)
+        rewards = rollouts.rewards + shaped
+        advantages, returns = advantages_and_returns(learner, rollouts, rewards, obs)
         run.background.start("value", learner.value.fit, obs, flat(returns), noise["value"])
         step = trpo.update(
             policy, obs, flat(rollouts.actions), flat(advantages), learner.cfg.trpo, noise["trpo"]
         )
     run.note("trpo", step)
+    run.note("rollout", {"reward": mean(rollouts.rewards), "shaping": mean(shaped)})
     return obs
 
 
 def advantages_and_returns(
-    learner: MazeLearner, rollouts: Rollouts, obs: Tensor
+    learner: MazeLearner, rollouts: Rollouts, rewards: Float32, obs: Tensor
 ) -> tuple[Float32, Float32]:
     """Generalised advantages and what the value function shall predict, each (T, N).
 
     Args:
         learner: whose value function judges.
         rollouts: the batch, (T, N, ...).
+        rewards: (T, N) the true ones and what shaping adds to them.
         obs: (N * T, obs_dim) its normalised observations, flat.
     """
     policy, value, cfg = learner.policy, learner.value, learner.cfg
@@ -260,9 +265,6 @@ def advantages_and_returns(
         return value(policy.normaliser(torch.from_numpy(raw))).numpy()
 
     values = value(obs).view(rollouts.rewards.T.shape).numpy().T
-    rewards = rollouts.rewards
-    if cfg.places.shaping:
-        rewards = rewards + shaping(learner, rollouts)
     return gae(
         rewards,
         values,
@@ -279,6 +281,8 @@ def shaping(learner: MazeLearner, rollouts: Rollouts) -> Float32:
     is left after it (Ng, Harada and Russell 1999, without a discount: with it, standing still far
     from the goal would pay). None for an action on which the body failed."""
     cfg, (steps, n, dim) = learner.cfg.places, rollouts.achieved.shape
+    if not cfg.shaping:
+        return np.zeros_like(rollouts.rewards)
     goals = rollouts.goals.reshape(-1, dim)
 
     def left(places: Float32) -> FloatArray:
@@ -393,10 +397,12 @@ def measure(
     measured = None
     if run.measures():
         with run.clock.measure("evaluation"):
+            test_goals = test_env.test_goals()
+            learner.places.refresh(test_goals)  # as whoever loads the policy has them
             measured, by_mean, steps = coverage(
                 test_env,
                 learner.policy,
-                test_env.test_goals(),
+                test_goals,
                 learner.cfg.coverage.rollouts,
                 learner.noise["evaluation"],
             )
@@ -460,12 +466,15 @@ def report(
     about_traces = {
         "traces": traces.valid.shape[1],
         "valid": mean(traces.valid),
+        **{f"valid_{n}": traces.survival(n // cfg.action_repeat) for n in DEPTHS},
         "decoded": len(seeds.goals) / max(1, wanted),
         "shift": mean(seeds.shift),
     }
+    about_places = {"known": len(learner.places), "moves": learner.places.moves.nnz}
     run.report(
         group("rollout", told)
         | group("curriculum", about_goals)
+        | group("places", about_places)
         | group("backtracking", about_traces),
         state=lambda: {"learner": learner.state_dict()},
         frame=frame,

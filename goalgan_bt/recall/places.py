@@ -57,7 +57,8 @@ class Places:
         # A point of the lattice has a number, its key; a step along axis i adds strides[i] to it.
         self._sides = np.ceil((self._high - self._low) / cfg.cell).astype(np.int64) + 2
         self._strides = np.concatenate([[1], np.cumprod(self._sides[:-1])])
-        self._take(np.empty(0, np.int64), csr_array((0, 0)))
+        self.moves = csr_array((0, 0))
+        self._number(np.empty(0, np.int64))
         self.refresh()
 
     def __len__(self) -> int:
@@ -77,7 +78,8 @@ class Places:
         made = [np.empty((2, 0), np.int64)]
         for lag in self.cfg.lags:
             first, last = slice(max(0, begun.shape[1] - lag + 1)), slice(lag - 1, None)
-            squared = np.square(ends[:, last] - origins[:, first]).sum(axis=2)
+            with np.errstate(invalid="ignore"):  # a diverged body is not near
+                squared = np.square(ends[:, last] - origins[:, first]).sum(axis=2)
             move = (squared <= self.cfg.reach**2) & (episode[:, first] == episode[:, last])
             move &= begun[:, first] != ended[:, last]
             made.append(np.stack([begun[:, first][move], ended[:, last][move]]))
@@ -85,7 +87,7 @@ class Places:
         k = len(self)
         self.moves.resize((k, k))
         if self.cfg.forget:
-            actions = np.bincount(begun.ravel(), minlength=k)
+            actions = np.bincount(begun[begun >= 0], minlength=k)
             self.moves = csr_array(diags_array(np.exp2(-actions / self.cfg.forget)) @ self.moves)
             self.moves.data[self.moves.data < ONCE] = 0.0
             self.moves.eliminate_zeros()
@@ -105,8 +107,8 @@ class Places:
         self._costs = either if self.cfg.both_ways else made
         self._slopes = slopes(self.places, either)
         self._tree = cKDTree(self.places)
-        # For some goals (rows) at every place (columns): 1, the way that is left, its direction; all
-        # zero where no way is known, as at the last place, which is none.
+        # For some goals (rows), at every place (columns): 1, the way that is left, its direction;
+        # zeros where no way is known, as at the last place, which is none.
         self._table = np.zeros((0, k + 1, 2 + dim), np.float32)
         self._row = np.full(k, -1)  # by the place nearest to the goal
         self._asked, self._rows = np.empty(0, np.int64), np.empty(0, np.int64)  # by a goal's key
@@ -132,7 +134,8 @@ class Places:
             mean[lost, 1] += away
         left = mean[:, 1] / np.maximum(mean[:, 0], 1e-9)
         length = np.sqrt(np.square(mean[:, 2:]).sum(axis=1))
-        as_seen = (straight < self._near) & (left < 1.5 * straight + 2 * self.cfg.cell)
+        in_sight = lost | (left < 1.5 * straight + 2 * self.cfg.cell)
+        as_seen = (straight < self.cfg.cell) | (straight < self._near) & in_sight
         as_seen |= ~(length > 1e-6)  # as where no way leads
         left = np.where(as_seen, straight, left)
         directions = mean[:, 2:] / np.maximum(length, 1e-6)[:, None]
@@ -166,24 +169,25 @@ class Places:
             raise ValueError("places visited are none of its lattice")
         if not np.isfinite(count).all():
             raise ValueError("a count of moves is not finite")
-        self._take(keys.astype(np.int64), csr_array((count, (a, b)), shape=(len(keys),) * 2))
+        self.moves = csr_array((count, (a, b)), shape=(len(keys), len(keys)))
+        self._number(keys.astype(np.int64))
         self.refresh()
 
     # The lattice.
 
-    def _take(self, keys: Nodes, moves: csr_array) -> None:
+    def _number(self, keys: Nodes) -> None:
+        """Number the places by their order in `keys`, (K,)."""
         self._keys = keys
         self._order = np.argsort(keys)
         self._sorted = keys[self._order]
         self.places = self._points(keys)
-        self.moves = moves
 
     def _visit(self, points: FloatArray) -> None:
         """Give the places nearest to points (n, goal_dim) numbers, if they have none."""
         there = points[np.isfinite(points).all(axis=1)]  # a diverged body is nowhere
         new = np.setdiff1d(self._keys_of(there), self._keys)
         if len(new):
-            self._take(np.concatenate([self._keys, new]), self.moves)
+            self._number(np.concatenate([self._keys, new]))
 
     def _on_lattice(self, points: FloatArray) -> FloatArray:
         """Points (..., goal_dim) in units of the lattice, those outside of the box on its rim."""

@@ -1,5 +1,6 @@
 """Recall traces: the backtracking model unrolled backward (Recall Traces, section 2.1)."""
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -41,6 +42,12 @@ class Traces(NamedTuple):
             later = rng.integers(ages + 1, size=self.valid.shape)
             goals = places[later, np.arange(len(self.goals))]
         return Steps(self.states[self.valid], self.actions[self.valid], goals[self.valid])
+
+    def survival(self, actions: int) -> float:
+        """The share of traces that are still valid so many actions before their goal; NaN where
+        they are not that long, or none."""
+        known = 0 < actions <= len(self.valid) and self.valid.shape[1] > 0
+        return float(self.valid[actions - 1].mean()) if known else math.nan
 
     def paths(self, env: GoalEnv) -> Float32:
         """Achieved goals along each trace, (L, n, goal_dim), NaN after it stopped."""
