@@ -2,6 +2,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from goalgan_bt.curriculum.curriculum import GoalCurriculum
 from goalgan_bt.curriculum.goals import GoalMemory, SuccessEstimator, intermediate
 from goalgan_bt.curriculum.settings import GoalsConfig
 from goalgan_bt.learners import maze_config
@@ -78,8 +79,52 @@ def test_the_estimator_forgets_old_episodes():
     estimator.add(np.zeros((300, 2)), np.zeros(300, dtype=bool))
     assert estimator(np.zeros((1, 2))) == 0
     estimator.add(np.zeros((100, 2)), np.ones(100, dtype=bool))
-    assert len(estimator.goals) == 100
     assert estimator(np.zeros((1, 2))) == 1
+    estimator.add(np.zeros((9000, 2)), np.zeros(9000, dtype=bool))
+    assert len(estimator.goals) == 5000  # a memory of failures, longer than that of success
+
+
+def test_a_goal_is_hopeless_once_all_tries_near_it_have_failed():
+    estimator = SuccessEstimator(2, GoalsConfig(near=0.4, hopeless=3))
+    here, off, far = np.array([[0.0, 0.0]]), np.array([[0.5, 0.0]]), np.array([[9.0, 0.0]])
+    everywhere = np.concatenate([here, off, far])
+    assert not estimator.hopeless(everywhere).any()
+    estimator.add(here.repeat(2, axis=0), np.zeros(2, dtype=bool))
+    assert not estimator.hopeless(everywhere).any()  # two are not enough
+    estimator.add(here, np.zeros(1, dtype=bool))
+    assert estimator.hopeless(everywhere).tolist() == [True, False, False]
+    estimator.add(here, np.ones(1, dtype=bool))
+    estimator.add(far.repeat(3, axis=0), np.zeros(3, dtype=bool))
+    assert estimator.hopeless(far).all()
+    assert estimator.hopeless(here + 0.01).tolist() in ([True], [False])  # whichever are nearest
+
+
+def test_with_a_frontier_goals_are_tried_beyond_what_was_seen_until_they_fail_or_are_mastered():
+    cfg = GoalsConfig(near=0.4, frontier=1.4, hopeless=3, neighbours=2)
+    curriculum = GoalCurriculum([-5, -5], [5, 5], goals=cfg)
+    curriculum.see(np.array([[0.0, 0.0]]))
+    goals = np.array([[0.2, 0.0], [1.3, 0.0], [1.5, 0.0]])
+    assert curriculum.judge(goals, np.zeros(3)).labels.tolist() == [True, True, False]
+    assert curriculum.judge(goals, np.ones(3)).labels.tolist() == [False, False, False]
+    assert curriculum.judge(goals, np.full(3, np.nan)).labels.tolist() == [True, True, False]
+    curriculum.remember(np.array([[1.3, 0.1]] * 3), np.zeros(3))  # a wall, it seems
+    assert curriculum.judge(goals, np.zeros(3)).labels.tolist() == [True, False, False]
+    curriculum.remember(np.array([[0.2, 0.0]] * 3), np.ones(3))
+    assert curriculum.judge(goals, np.zeros(3)).labels.tolist() == [True, False, False]
+
+
+def test_of_many_imagined_goals_those_of_intermediate_difficulty_are_proposed():
+    def share(imagined):
+        cfg = GoalsConfig(near=1.0, imagined=imagined)
+        curriculum = GoalCurriculum([-5, -5], [5, 5], goals=cfg)
+        curriculum.see(np.array([[0.0, 0.0], [0.9, 0.0]]))
+        tried = curriculum.uniform(2000)
+        curriculum.remember(tried, curriculum.rng.random(2000) < 0.5)
+        goals = curriculum.propose(100)
+        assert goals.shape == (100, 2)
+        return curriculum.judge(goals, curriculum.estimator(goals)).labels.mean()
+
+    assert share(4) > 1.5 * share(1)
 
 
 def test_an_estimator_without_episodes_knows_nothing():

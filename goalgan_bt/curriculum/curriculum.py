@@ -250,11 +250,10 @@ class GoalCurriculum:
             return self.alp_gmm.sample(n)
         if self.cfg.source == "uniform":
             return self.uniform(n)
-        goals = self.gan.sample(n * max(1, self.cfg.reject))
-        if self.cfg.reject:
-            mastered = self.estimator(goals) >= self.cfg.r_max
-            far = self.visited.distance_to(goals) > self.cfg.near
-            goals = goals[np.argsort(mastered + 2 * far, kind="stable")[:n]]
+        goals = self.gan.sample(n * self.cfg.imagined)
+        if self.cfg.imagined > 1:
+            good = self._intermediate(goals, self.estimator(goals))
+            goals = goals[np.argsort(~good, kind="stable")[:n]]
             self.rng.shuffle(goals)
         if k := round(self.cfg.anywhere * n):
             goals[:k] = self.uniform(k)
@@ -319,12 +318,15 @@ class GoalCurriculum:
         """Labels of goals (n, goal_dim) with that success (n,): intermediate difficulty, (n,).
 
         Besides the bounds on success, a goal must be near a place where the agent has been: the
-        estimator averages over neighbours, and beside a mastered place there may be a wall.
+        estimator averages over neighbours, and beside a mastered place there may be a wall. With a
+        frontier it must be near enough to one to be tried, and not hopeless: what lies beyond all
+        that the agent has seen is learned by trying, and so are the walls.
         """
-        near = self.visited.distance_to(goals) <= self.cfg.near
-        if self.cfg.possible:
-            return (success < self.cfg.r_max) & near
-        return intermediate(success, self.cfg.r_min, self.cfg.r_max) & near
+        away = self.visited.distance_to(goals)
+        if self.cfg.frontier:
+            worth = (away <= self.cfg.frontier) & ~self.estimator.hopeless(goals)
+            return worth & ~(success >= self.cfg.r_max)
+        return intermediate(success, self.cfg.r_min, self.cfg.r_max) & (away <= self.cfg.near)
 
     def _rows(self, goals: ArrayLike | None, name: str) -> FloatArray:
         """Goals as rows in the units of the settings; none if there are none.

@@ -8,11 +8,13 @@ gives shares of 0, 1/2 or 1; the recent episodes to nearby goals estimate p inst
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from goalgan_bt.curriculum.settings import GoalsConfig
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 
+TRIES = 5000  # episodes whose failures count
 AT_ONCE = 1_000_000  # distances, so that many places visited cost time and not memory
 
 
@@ -75,8 +77,9 @@ class SuccessEstimator:
 
     def add(self, goals: FloatArray, success: FloatArray | BoolArray) -> None:
         """Remember finished episodes: goals (n, goal_dim) and whether each was reached, (n,)."""
-        self.goals = np.concatenate([self.goals, goals])[-self.cfg.episodes :]
-        self.success = np.concatenate([self.success, success])[-self.cfg.episodes :]
+        kept = max(self.cfg.episodes, TRIES)
+        self.goals = np.concatenate([self.goals, goals])[-kept:]
+        self.success = np.concatenate([self.success, success])[-kept:]
 
     def state_dict(self) -> dict[str, Tensor]:
         """The episodes that it remembers."""
@@ -89,9 +92,21 @@ class SuccessEstimator:
     def __call__(self, goals: FloatArray) -> FloatArray:
         """Estimated success, (n, goal_dim) -> (n,) in [0, 1]; NaN while nothing is known."""
         k = self.cfg.neighbours
-        if len(self.goals) < k:
+        tried, success = self.goals[-self.cfg.episodes :], self.success[-self.cfg.episodes :]
+        if len(tried) < k:
             return np.full(len(goals), np.nan)
         # The squared distance less |goal|^2, which is the same for all of a row.
-        distance = np.square(self.goals).sum(axis=1) - 2 * goals @ self.goals.T
+        distance = np.square(tried).sum(axis=1) - 2 * goals @ tried.T
         nearest = np.argpartition(distance, k - 1, axis=1)[:, :k]
-        return np.asarray(self.success[nearest].mean(axis=1))
+        return np.asarray(success[nearest].mean(axis=1))
+
+    def hopeless(self, goals: FloatArray) -> BoolArray:
+        """Whether the nearest tries of those remembered, as many as `cfg.hopeless`, were within
+        `cfg.near` of a goal and failed, (n, goal_dim) -> (n,)."""
+        k = self.cfg.hopeless
+        if len(self.goals) < k:
+            return np.zeros(len(goals), dtype=bool)
+        distance, nearest = cKDTree(self.goals).query(goals, range(1, k + 1))
+        return np.asarray(
+            (distance <= self.cfg.near).all(axis=1) & ~self.success[nearest].any(axis=1)
+        )

@@ -37,10 +37,15 @@ class GoalsConfig:
     near: Annotated[float, ABOVE_ZERO_OR_INFINITE] = 0.4
     """A goal farther than this from all places where the agent has been is too hard, metres (the
     original: inf). Without it, walls around mastered places look intermediate."""
-    reject: Annotated[int, NOT_NEGATIVE] = 0
-    """Goals imagined for each that is proposed: those called mastered are left out."""
-    possible: bool = False
-    """Labels without lower bound: any place where the agent has been."""
+    frontier: Annotated[float, NOT_NEGATIVE] = 0.0
+    """If above 0, a goal is worth trying until it is mastered wherever the agent has been and this
+    far beyond, metres, unless tries near it have all failed; r_min then counts for nothing (the
+    original: 0)."""
+    hopeless: Annotated[int, ABOVE_ZERO] = 5
+    """How many tries within `near` must have failed, and none succeeded, among the last 5,000."""
+    imagined: Annotated[int, ABOVE_ZERO] = 1
+    """Goals imagined for each that is proposed: those of intermediate difficulty come first (the
+    original: 1)."""
     label_rollouts: Annotated[int, NOT_NEGATIVE] = 0
     """Fresh episodes per goal for its label (the original: 3); 0 takes labels from training."""
     episodes: Annotated[int, ABOVE_ZERO] = 1000
