@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
+import torch
 
 from goalgan_bt import envs
 from goalgan_bt.envs import ant_maze
@@ -282,6 +283,53 @@ def test_the_ants_observation_holds_state_and_goal():
     assert np.allclose(obs[0, 33:35], [4 / 6, -0.5], atol=1e-6)
     assert np.allclose(obs[:, 35:37], [0.1, -0.5], atol=1e-6)
     assert np.allclose(obs[:, 37:39], 0, atol=1e-6)
+
+
+def to_the_left(places, goals):
+    """A way that begins to the left of the goal, twice as long as the straight line."""
+    x, y = (goals - places).T
+    return 2 * np.stack([-y, x], axis=1)
+
+
+def test_with_a_heading_the_ant_faces_the_way_and_still_sees_where_the_goal_is():
+    env, states, goals = ant_states()
+    plain = env.observations(states, goals)
+    env.heading = to_the_left
+    obs = env.observations(states, goals)
+    assert obs.shape == (len(states), env.obs_dim) == (len(states), 41)
+    offset = goals - env.achieved_goals(states)
+    assert np.allclose(obs[:, 39:], plain[:, 29:31], atol=1e-6)  # the straight offset
+    along = to_the_left(0 * offset, offset)
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    assert np.allclose(obs[:, 29:31], along / (1 + length), atol=1e-6)
+    ahead, left = obs[:, 33:35].T
+    assert (ahead > 0).all() and (np.abs(left) < ahead + 0.1).all()
+    actions = np.random.default_rng(1).uniform(-1, 1, (len(states), 8))
+    there = env.to_body(actions, states, goals)
+    assert np.allclose(env.from_body(there, states, goals), actions)
+    turned = states[:, :2] + along
+    assert np.allclose(
+        there, ant_maze._renumber_actions(actions, -ant_maze.quarter_turns(states, turned))
+    )
+
+
+@pytest.mark.parametrize("name", ["point_umaze", "point_nd"])
+def test_with_a_heading_a_point_sees_the_way_beside_the_goal(name):
+    env = envs.make(name, 1)
+    states = np.array([[0.1, 0.2, 1.0, -1.0]])
+    goals = np.array([[3.1, 4.2]])
+    plain = env.observations(states, goals)
+    env.heading = to_the_left
+    obs = env.observations(states, goals)
+    assert obs.shape == (1, env.obs_dim) == (1, 8) and np.allclose(obs[:, :6], plain)
+    assert np.allclose(obs[0, 6:], np.array([-8.0, 6.0]) / 10.3, atol=1e-6)  # 10 m, within 0.3
+
+
+def test_a_heading_is_asked_for_tensors_too():
+    env, states, goals = ant_states(5)
+    env.heading = to_the_left
+    as_tensors = torch.from_numpy(states), torch.from_numpy(goals)
+    assert np.allclose(env.observations(*as_tensors), env.observations(states, goals), atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ALL)

@@ -6,11 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from conftest import call
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from goalgan_bt.agent.rollout import Collector
+from goalgan_bt.learners import table
+from goalgan_bt.learners.maze import shaping, train
+from goalgan_bt.learners.maze_config import make_env
+from goalgan_bt.learners.maze_learner import MazeLearner
+from goalgan_bt.learners.trained_policy import load_policy
 from goalgan_bt.recall.places import Places
 from goalgan_bt.recall.settings import PlacesConfig
+from goalgan_bt.runs.frames import frame_paths, read_frame
+from goalgan_bt.runs.metrics_csv import read_metrics
 
 LOW, HIGH = np.array([-2.0, -2.0]), np.array([6.0, 6.0])
 CFG = PlacesConfig()
@@ -221,3 +230,92 @@ def test_as_many_answers_as_questions():
     twice = places.heading(U, U[::-1].copy())
     twice[:] = 99.0  # whoever gets an answer may change it
     assert not (places.heading(U, U[::-1].copy()) == 99.0).any()
+
+
+# What the learner makes of them.
+
+
+def learner_and_rollouts(*flags, batches=2):
+    cfg = table.from_command_line(
+        ["--env", "point_umaze", "--threads", "1", "--horizon", "60", *flags]
+    )
+    env = make_env(cfg, cfg.rollout.num_envs)
+    learner = MazeLearner(env, cfg)
+    collector = Collector(env, cfg.rollout, learner.rng, learner.noise["rollout"])
+    goals = learner.curriculum.uniform(100) / 3
+    collector.begin(goals)
+    for _ in range(batches):
+        rollouts, _ = collector.collect(learner.policy, goals)
+        learner.places.learn(rollouts.origins.swapaxes(0, 1), rollouts.achieved.swapaxes(0, 1))
+        learner.places.refresh(goals)
+    return learner, rollouts
+
+
+def test_shaping_adds_up_to_the_difference_of_its_ends_along_an_episode():
+    learner, rollouts = learner_and_rollouts("--places.shaping", "0.7")
+    shaped = shaping(learner, rollouts)
+    ended = rollouts.terminated | rollouts.truncated
+    pieces = 0
+    for i in range(shaped.shape[1]):
+        begin = 0
+        for end in [*np.flatnonzero(ended[:, i]), len(ended) - 1]:
+            if begin > end:
+                continue
+            goal = rollouts.goals[[begin], i]
+            assert (rollouts.goals[begin : end + 1, i] == goal).all()
+            first, last = (
+                learner.places.ways(place, goal).left[0]
+                for place in (rollouts.origins[[begin], i], rollouts.achieved[[end], i])
+            )
+            assert shaped[begin : end + 1, i].sum() == pytest.approx(0.7 * (first - last), abs=1e-4)
+            begin, pieces = end + 1, pieces + 1
+    assert pieces > shaped.shape[1] and np.abs(shaped).max() > 0.01
+
+
+def test_the_action_on_which_a_body_fails_is_not_shaped():
+    learner, rollouts = learner_and_rollouts()
+    rollouts.terminated[3, 0], rollouts.rewards[3, 0] = True, 0.0
+    rollouts.achieved[3, 0] = np.nan  # as a simulation that diverged
+    shaped = shaping(learner, rollouts)
+    assert shaped[3, 0] == 0 and np.isfinite(shaped).all() and (shaped != 0).mean() > 0.5
+
+
+def test_without_a_scale_nothing_is_shaped():
+    learner, rollouts = learner_and_rollouts("--places.shaping", "0")
+    assert not shaping(learner, rollouts).any()
+
+
+def test_shaping_never_reaches_true_rewards_labels_or_outcomes(tmp_path):
+    """Until the policy has learned from it, all else is the same."""
+    rows, frames = [], []
+    for scale in ("0", "0.5"):
+        folder = tmp_path / scale
+        folder.mkdir()
+        flags = "--env point_umaze --threads 1 --iterations 1 --updates 1 --horizon 40"
+        train(table.from_command_line([*flags.split(), "--places.shaping", scale]), folder)
+        rows += read_metrics(folder)[1]
+        frames.append(read_frame(frame_paths(folder)[-1]))
+    without, with_it = rows
+    assert float(without["rollout/shaping"]) == 0 != float(with_it["rollout/shaping"])
+    for name in ("rollout/reward", "rollout/success", "curriculum/intermediate", "places/moves"):
+        assert without[name] == with_it[name] and float(without[name]) >= 0, name
+    for name in ("success", "label", "goals", "estimate"):
+        assert np.array_equal(frames[0][name], frames[1][name], equal_nan=True), name
+
+
+def test_a_policy_takes_its_places_along(tmp_path):
+    """Whoever loads it sees the ways as it did when it was saved."""
+    flags = "--env point_umaze --threads 1 --iterations 3 --updates 2 --horizon 60"
+    cfg = table.from_command_line(flags.split())
+    assert call("train", *flags.split(), "--viz", "none", "--out", tmp_path).returncode == 0
+    (folder,) = tmp_path.iterdir()
+    trained = load_policy(folder)
+    saved = torch.load(folder / "checkpoint.pt", weights_only=True)["learner"]["places"]
+    places = Places(trained.env.goal_low, trained.env.goal_high, 0.3, cfg.places)
+    places.load_state_dict(saved)
+    at, goals = np.random.default_rng(0).uniform(-1, 5, (2, 50, 2))
+    assert len(places) > 10
+    assert np.array_equal(trained.env.heading(at, goals), places.heading(at, goals))
+    assert trained.env.obs_dim == 8
+    straight = table.from_command_line([*flags.split(), "--no-places.heading"])
+    assert MazeLearner(make_env(straight, 1), straight).policy.normaliser.mean.shape == (6,)

@@ -51,6 +51,21 @@ def test_observations_follow_from_each_other(chain):
         assert step.rewards[0] == rollouts.rewards[t, n]
 
 
+@pytest.mark.parametrize("chain", [0.0, 1.0])
+def test_each_action_begins_where_the_last_one_ended_unless_an_episode_did(chain):
+    _, policy, collector = make(chain=chain)
+    collector.begin(NEAR)
+    for _ in range(2):
+        rollouts, _ = collector.collect(policy, NEAR)
+        places, offsets = rollouts.obs[..., :2], rollouts.obs[..., 4:6]
+        assert rollouts.origins == pytest.approx(places, abs=1e-6)
+        assert rollouts.goals == pytest.approx(places + offsets, abs=1e-5)
+        ended = (rollouts.terminated | rollouts.truncated)[:-1]
+        follows = (rollouts.origins[1:] == rollouts.achieved[:-1]).all(axis=2)
+        assert follows[~ended].all() and ended.any()
+        assert follows[ended].all() == bool(chain)
+
+
 def test_next_values_put_each_value_into_its_slot():
     _, policy, collector = make()
     collector.begin(NEAR)
