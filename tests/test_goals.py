@@ -134,7 +134,7 @@ def test_an_estimator_without_episodes_knows_nothing():
 
 
 def test_only_goals_near_visited_places_are_intermediate():
-    cfg = maze_config.preset("ant_umaze")
+    cfg = maze_config.preset("ant_umaze", "goal_gan")
     curriculum = MazeLearner(make_env(cfg, 1), cfg).curriculum
     curriculum.see(np.array([[0.0, 0.0]]))
     near, far = cfg.goals.near * 0.9, cfg.goals.near * 1.1

@@ -317,5 +317,5 @@ def test_a_policy_takes_its_places_along(tmp_path):
     assert len(places) > 10
     assert np.array_equal(trained.env.heading(at, goals), places.heading(at, goals))
     assert trained.env.obs_dim == 8
-    straight = table.from_command_line([*flags.split(), "--no-places.heading"])
+    straight = table.from_command_line([*flags.split(), "--places.no-heading"])
     assert MazeLearner(make_env(straight, 1), straight).policy.normaliser.mean.shape == (6,)

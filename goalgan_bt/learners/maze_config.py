@@ -33,9 +33,11 @@ class MazeConfig(RunConfig):
     env: str = "ant_umaze"
     """Environment: {point,ant}_{umaze,spiral,medium,large} or point_nd. Picks the preset."""
     method: str = "recall_traces"
-    """What to learn with: recall_traces, recall_traces_paper; without traces goal_gan, gan_fit_all,
-    uniform, feasible, oracle, alp_gmm; the controls no_imitation, random_model, self_imitation,
-    hindsight, value_seeds, forward_model. Picks settings; other flags come on top."""
+    """What to learn with: recall_traces (over places), recall_traces_paper (over full states);
+    without recall goal_gan, gan_fit_all, uniform, feasible, oracle, alp_gmm; the controls
+    shaping_only, heading_only, straight_line, goals_only, with_traces, feasible_places; of traces
+    over full states traces_only, no_imitation, random_model, self_imitation, hindsight,
+    value_seeds, forward_model. Picks settings; other flags come on top."""
     resume: Path | None = None
     """Go on with this run (its folder): its settings are the defaults, and its limits, which count
     from its beginning, hold unless others are given. With later limits the exploration noise goes
@@ -98,9 +100,11 @@ ANT = MazeConfig(
     total_steps=12_000_000,
     action_repeat=2,
     discount=0.993,
+    gae_lambda=0.9,
     updates=4,
     policy=PolicyConfig(init_std=0.2, final_std=0.07),
     rollout=RolloutConfig(num_envs=256, steps=50),
+    goals=GoalsConfig(frontier=1.4, imagined=4),
     gan=GanConfig(steps=50, generator_hidden=(128, 128)),
     backtracking=BacktrackingConfig(trace_length=50),
     imitation=ImitationConfig(steps=10, learning_rate=5e-5, max_kl=0.003, fade=0.3),
@@ -114,8 +118,9 @@ POINT = MazeConfig(
     policy=PolicyConfig(input_gain=3.0, init_std=1.0, final_std=0.3),
     value=ValueConfig(input_gain=3.0, minibatch=128),
     rollout=RolloutConfig(num_envs=64, steps=20),
-    goals=GoalsConfig(old=40, r_min=0.05),
+    goals=GoalsConfig(old=40, r_min=0.05, frontier=0.7, imagined=4),
     trpo=TrpoConfig(max_kl=0.015),
+    places=PlacesConfig(shaping=0.3),
     backtracking=BacktrackingConfig(trace_length=20),
     imitation=ImitationConfig(steps=40, max_kl=0.05, fade=0.15),
     coverage=CoverageConfig(rollouts=2, every=250_000),
@@ -148,8 +153,9 @@ def with_method(cfg: MazeConfig, method: str) -> MazeConfig:
     if method not in METHODS:
         raise UsageError(f"unknown method {method!r}: choose one of {', '.join(METHODS)}")
     for name, value in METHODS[method].items():
-        part, key = name.split(".")
-        cfg = replace(cfg, **{part: replace(getattr(cfg, part), **{key: value})})
+        part, dot, key = name.partition(".")
+        settings = replace(getattr(cfg, part), **{key: value}) if dot else value
+        cfg = replace(cfg, **{part: settings})
     return replace(cfg, method=method)
 
 

@@ -23,8 +23,8 @@ class BacktrackingConfig:
     """The backtracking model and its recall traces (Goyal et al. 2019)."""
 
     trace_length: Annotated[int, NOT_NEGATIVE] = 20
-    """Length of a recall trace in environment steps (paper: 20 point, 50 ant); 0 is plain Goal
-    GAN. The model takes one backward step per action, `action_repeat` of them."""
+    """Length of a recall trace in environment steps (paper: 20 point, 50 ant), where traces are
+    imitated. The model takes one backward step per action, `action_repeat` of them."""
     traces: Annotated[int, NOT_NEGATIVE] = 200
     """Recall traces per iteration, at most."""
     hidden: Annotated[tuple[int, ...], ABOVE_ZERO] = (128, 128)
@@ -57,10 +57,10 @@ class BacktrackingConfig:
 class ImitationConfig:
     """Imitation of recall traces."""
 
-    source: Literal["traces", "experience", "forward"] = "traces"
-    """What is imitated: recall traces; as many real steps, as long before the end of their episode
-    (self-imitation); steps that a forward model imagines of the policy, where they reach the goal
-    (after Dyna). The latter two are controls."""
+    source: Literal["none", "traces", "experience", "forward"] = "none"
+    """What is imitated: nothing; recall traces of full states (the paper); as many real steps, as
+    long before the end of their episode (self-imitation); steps that a forward model imagines of
+    the policy, where they reach the goal (after Dyna)."""
     relabel: bool = True
     """Imitate each step for a random later place of its trace or episode (hindsight) instead of
     for the goal at its end (the paper)."""
