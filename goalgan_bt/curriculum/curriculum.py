@@ -113,7 +113,7 @@ class GoalCurriculum:
         if not self._begun:
             return self._outward(self.uniform(n))
         share = self.cfg.old / max(1, self.cfg.new + self.cfg.old)
-        remembered = self.replay.sample(self.rng.binomial(n, share), self.rng)
+        remembered = self.recollect(self.rng.binomial(n, share))
         return self._outward(np.concatenate([self.propose(n - len(remembered)), remembered]))
 
     def tell(
@@ -258,6 +258,12 @@ class GoalCurriculum:
         if k := round(self.cfg.anywhere * n):
             goals[:k] = self.uniform(k)
         return goals
+
+    def recollect(self, n: int) -> FloatArray:
+        """At most n goals that once were intermediate, (<= n, goal_dim), so that old skills stay;
+        with a frontier none that has turned out to be hopeless."""
+        goals = self.replay.sample(len(self.replay), self.rng)
+        return goals[~self.estimator.hopeless(goals)][:n] if self.cfg.frontier else goals[:n]
 
     def remember(self, goals: FloatArray, success: FloatArray | BoolArray) -> None:
         """Take in finished episodes from the start: goals (n, goal_dim), success (n,)."""

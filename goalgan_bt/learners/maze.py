@@ -204,7 +204,7 @@ def propose(learner: MazeLearner, test_env: GoalEnv, run: Session) -> Goals:
     """The goals of an iteration."""
     imagined, steps = learner.propose(test_env)
     run.count("label", steps)
-    remembered = learner.curriculum.replay.sample(learner.cfg.goals.old, learner.rng)
+    remembered = learner.curriculum.recollect(learner.cfg.goals.old)
     goals = Goals(np.concatenate([imagined, remembered]), len(imagined))
     learner.places.refresh(goals.all)
     return goals
