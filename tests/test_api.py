@@ -121,6 +121,7 @@ def test_a_policy_to_take_away_acts_as_it_did(trained):
     noisy = policy.act(states, goals, deterministic=False)
     assert not np.allclose(noisy, actions)
     env = make_env(load(trained), 1)
+    env.heading = policy.env.heading
     env.reset(np.arange(1), goals[:1])
     observed = env.observe(np.arange(1))
     by_env = np.clip(policy._act(observed, None), -1, 1)

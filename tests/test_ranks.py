@@ -107,6 +107,9 @@ def test_one_and_two_ranks_make_the_same_update(tmp_path):
     ):
         for key in ours.keys() - {"_extra_state"}:
             assert torch.allclose(ours[key], theirs[key], atol=1e-3, rtol=1e-3), key
+    assert len(one["places"]["keys"]) > 10 and len(one["places"]["count"]) > 20
+    for name, ours in one["places"].items():  # the same places, and as many moves between them
+        assert torch.equal(ours, two["places"][name]), name
     seen = one["curriculum"]["estimator"], two["curriculum"]["estimator"]
     assert len(seen[0]["goals"]) > 0
     assert torch.allclose(seen[0]["goals"], seen[1]["goals"], atol=1e-3)

@@ -87,13 +87,14 @@ def test_a_tiny_run_leaves_a_whole_run_folder(env, tmp_path):
         assert set(np.unique(frame["label"])) <= {-1, 0, 1}
         assert frame["coverage"].shape == frame["estimate"].shape == (len(frame["test_goals"]),)
         assert set(np.unique(frame["coverage"])) <= {0.0, 1.0}  # one attempt each
-        assert (coverage > 0.05) == (env == "ant_umaze")  # a novice has the tiles beneath it
+        assert (coverage > 0.12) == (env == "ant_umaze")  # a novice has the tiles beneath it
         assert frame["coverage"].mean() == pytest.approx(coverage)
         assert frame["traces"].shape[1] == len(frame["trace_goals"])
 
 
 def test_recall_traces_are_learned_and_imitated(tmp_path):
-    tiny = "--iterations", "14", "--goals.near", "inf", "--goals.neighbours", "4"
+    tiny = "--method", "traces_only", "--iterations", "14"
+    tiny += "--goals.near", "inf", "--goals.neighbours", "4"
     train(settings("ant_umaze", *tiny), tmp_path)
     rows = columns(tmp_path)
     assert any(r.get("imitation/loss") for r in rows)
