@@ -28,7 +28,7 @@ from goalgan_bt.viz.curves import joined, thinned
 from goalgan_bt.viz.download import as_csv
 from goalgan_bt.viz.player import Player
 from goalgan_bt.viz.run import Run, success
-from goalgan_bt.viz.scene import colours, segments, tile_image
+from goalgan_bt.viz.scene import ARROW, arrows, colours, segments, tile_image
 from goalgan_bt.viz.view import View, report_at
 
 
@@ -335,6 +335,38 @@ def test_a_click_leads_to_an_attempt_with_an_outcome(view):
     while "reached" not in view._outcome.content and time.monotonic() < end:
         view._play_body(time.monotonic())
     assert "Goal (0.2, 0.0): **reached** after" in view._outcome.content
+
+
+def test_arrows_by_hand():
+    there, along = np.array([[1.0, 2.0]]), np.array([[0.0, 1.0]])
+    shaft, one, other = arrows(there, along)
+    assert shaft[:, :2] == pytest.approx(np.array([[1, 2 - ARROW / 2], [1, 2 + ARROW / 2]]))
+    for barb, side in ((one, -1), (other, 1)):
+        assert barb[1] == pytest.approx(shaft[1])  # at the tip, and back from there
+        assert np.sign(barb[0, 0] - 1) == side and shaft[0, 1] < barb[0, 1] < shaft[1, 1]
+    assert arrows(there[:0], along[:0]).shape == (0, 2, 3)
+
+
+def test_arrows_lead_to_the_goal_that_was_set_and_to_none_of_many(view, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(view._scenes[0], "draw_ways", lambda *field: drawn.append(field))
+    view._ask("goal", np.array([0.2, 0.0]))
+    view.tick(time.monotonic())
+    places, directions = drawn[-1]
+    assert len(places) == len(view._player.env.test_goals())
+    assert np.linalg.norm(directions, axis=1) == pytest.approx(1)
+    near = np.linalg.norm(places - [0.2, 0.0], axis=1) < 0.4
+    cosines = (directions * ([0.2, 0.0] - places)).sum(axis=1)[near]
+    assert near.any() and (cosines > 0).all()
+    view._ask("all", None)
+    view.tick(time.monotonic())
+    assert len(drawn[-1][0]) == 0
+
+
+def test_without_a_heading_there_are_no_arrows(folder):
+    player = Player(folder)
+    player.env.heading = None
+    assert len(player.ways(np.array([[0.2, 0.0]]))[0]) == 0
 
 
 def test_how_an_attempt_ended_is_told_however_late(view):

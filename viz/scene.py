@@ -24,7 +24,7 @@ TOO_HARD, INTERMEDIATE, TOO_EASY, REPLAYED = (
     (120, 120, 120),
 )
 TRACE, OLD_TRACE = (255, 150, 0), (25, 12, 12)  # at the goal, and farthest back
-PATH, WAY, MARK = (90, 90, 100), (20, 20, 25), (255, 0, 170)
+PATH, MARK = (90, 90, 100), (255, 0, 170)
 WALL, FLOOR, START = (105, 110, 120), (45, 48, 54), (255, 255, 255)
 FAR_BELOW = np.full((1, 1, 3), -100, dtype=np.float32)  # where a layer with nothing in it is
 PIXELS = 16  # per tile of the coverage map
@@ -211,7 +211,7 @@ class Scene:
     def draw_ways(self, places: FloatArray, directions: FloatArray) -> None:
         """Draw a field of arrows: where, and in which directions of length 1, each (n, goal_dim);
         none clear it."""
-        self._lines("ways", arrows(places, directions), WAY, 1.5)
+        self._lines("ways", arrows(places, directions), MARK, 1.5)
 
     def _name(self, layer: str, node: str = "node") -> str:
         return f"{self._prefix}/{layer}/{node}"
