@@ -1,6 +1,7 @@
 """Recall over places: the ways left are those that were walked, however the walks were made."""
 
 import itertools
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -77,8 +78,11 @@ def test_one_action_of_progress_shows(x):
 
 
 def test_a_move_made_one_way_only_is_not_assumed_the_other_way_where_the_setting_says_so():
-    forth = replace(CFG, both_ways=False)
-    assert way(walked(U), (0, 2), (0, 0))[0] == pytest.approx(10, rel=0.1)
+    forth = replace(CFG, backward=math.inf)
+    alike = walked(U, cfg=replace(CFG, backward=1.0))
+    assert way(alike, (0, 2), (0, 0))[0] == pytest.approx(10, rel=0.1)
+    left, direction = way(walked(U, cfg=replace(CFG, backward=2.0)), (0, 2), (0, 0))
+    assert left == pytest.approx(20, rel=0.1) and direction @ (1, 0) > 0.98
     one_way = walked(U, cfg=forth)
     assert way(one_way, (0, 0), (0, 2))[0] == pytest.approx(10, rel=0.1)
     assert way(one_way, (0, 2), (0, 0))[0] == pytest.approx(2)  # unknown: the straight line
@@ -156,7 +160,7 @@ def test_in_the_open_ways_are_nearly_straight_in_any_dimension(dim, n, cell):
     rng = np.random.default_rng(0)
     low, high = -np.ones(dim), np.array([2.0, 2.0, 2.0, -0.5, -0.5, -0.5][:dim])
     paths = everywhere(low, high, n, 0.12, rng)
-    cfg = replace(CFG, cell=cell, reach=2.4 * cell)
+    cfg = replace(CFG, cell=cell, reach=2.4 * cell, backward=1.0)
     places = Places(low, high, 0.3, cfg)
     places.learn(paths[:, :-1], paths[:, 1:])
     places.refresh()
@@ -204,13 +208,13 @@ def test_what_is_no_state_of_places_is_refused():
 @given(
     seed=st.integers(0, 2**31),
     cell=st.floats(0.1, 1.0),
-    both=st.booleans(),
+    back=st.sampled_from([0.5, 1.0, 3.0, math.inf]),
     dim=st.integers(1, 4),
 )
-def test_whatever_was_walked_ways_are_finite_and_directions_of_length_one(seed, cell, both, dim):
+def test_whatever_was_walked_ways_are_finite_and_directions_of_length_one(seed, cell, back, dim):
     rng = np.random.default_rng(seed)
     low, high = np.full(dim, -2.0), np.full(dim, 3.0)
-    cfg = replace(CFG, cell=cell, reach=2.5 * cell, both_ways=both, forget=rng.choice([0.0, 50.0]))
+    cfg = replace(CFG, cell=cell, reach=2.5 * cell, backward=back, forget=rng.choice([0.0, 50.0]))
     places = Places(low, high, 0.3, cfg)
     paths = everywhere(low * 1.3, high * 1.3, 4, 0.3, rng)  # out of the box, too
     paths[rng.random(paths.shape) < 0.02] = rng.choice([np.nan, np.inf])

@@ -11,6 +11,7 @@ The way that is left is a potential of the agent's own making (Ng, Harada and Ru
 direction a part of what the policy sees: the two uses of it in `PlacesConfig`.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -104,7 +105,8 @@ class Places:
         length = np.sqrt(np.square(self.places[b] - self.places[a]).sum(axis=1))
         made = csr_array((length, (a, b)), shape=(k, k))
         either = csr_array(made.maximum(made.T))
-        self._costs = either if self.cfg.both_ways else made
+        back = self.cfg.backward
+        self._costs = made if math.isinf(back) else csr_array(back * either - (back - 1) * made)
         self._slopes = slopes(self.places, either)
         self._tree = cKDTree(self.places)
         # For some goals (rows), at every place (columns): 1, the way that is left, its direction;

@@ -6,7 +6,7 @@ Apart from the code that reads them, so that a command line answers before torch
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from goalgan_bt.runs.ranges import ABOVE_ZERO, NOT_NEGATIVE, Range, faults
+from goalgan_bt.runs.ranges import ABOVE_ZERO, ABOVE_ZERO_OR_INFINITE, NOT_NEGATIVE, Range, faults
 
 MOST_RECALLED = 1_000_000  # steps at a time: beyond it memory, not sense, is the limit
 
@@ -94,8 +94,9 @@ class PlacesConfig:
     """Length of a move at most, metres."""
     lags: Annotated[tuple[int, ...], ABOVE_ZERO] = (1, 2, 5, 10, 20)
     """Actions that a move takes."""
-    both_ways: bool = True
-    """Whether a move that was made can be made the other way."""
+    backward: Annotated[float, ABOVE_ZERO_OR_INFINITE] = 3.0
+    """How many times its length a move costs the other way, where it was made one way only: 1
+    takes it for possible, inf for impossible."""
     forget: Annotated[float, NOT_NEGATIVE] = 0.0
     """After so many actions from where a move begins it counts half as much, and less than half a
     move is forgotten: one that works no longer; 0 forgets none."""
