@@ -34,10 +34,11 @@ class MazeConfig(RunConfig):
     """Environment: {point,ant}_{umaze,spiral,medium,large} or point_nd. Picks the preset."""
     method: str = "recall_traces"
     """What to learn with: recall_traces (over places), recall_traces_paper (over full states);
-    without recall goal_gan, gan_fit_all, uniform, feasible, oracle, alp_gmm; the controls
-    shaping_only, heading_only, straight_line, goals_only, with_traces, feasible_places; of traces
-    over full states traces_only, no_imitation, random_model, self_imitation, hindsight,
-    value_seeds, forward_model. Picks settings; other flags come on top."""
+    without recall goal_gan, gan_fit_all, uniform, feasible, oracle, alp_gmm; controls of the first:
+    shaping_only, heading_only, goals_only, straight_line, with_traces, with_hindsight,
+    feasible_places; of traces over full states: traces_only, no_imitation, random_model,
+    self_imitation, hindsight, value_seeds, forward_model. Picks settings; other flags come on
+    top."""
     resume: Path | None = None
     """Go on with this run (its folder): its settings are the defaults, and its limits, which count
     from its beginning, hold unless others are given. With later limits the exploration noise goes

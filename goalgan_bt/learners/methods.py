@@ -47,6 +47,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "straight_line": {"places.way": "straight", "places.heading": False},
     "goals_only": {"places.shaping": 0.0, "places.heading": False},
     "with_traces": {"imitation.source": "traces"},
+    "with_hindsight": {"imitation.source": "experience"},
     # Traces of full states alone, tuned as we can, and their controls. Real steps of successes for
     # their own goal, or of all episodes for later places, take the place of traces, with as many
     # updates. Without imitation all is as in goal_gan but for the random numbers: so far apart are
