@@ -23,6 +23,13 @@ The backtracking model alone: what state and action may have led to a state, unr
     model.fit(states, actions, next_states, steps=2000)
     traces = goalgan_bt.recall_traces(model, seeds, length, valid=valid, repair=repair)
 
+The same over places: which way leads from where the agent is to a goal, over where it has been.
+
+    places = goalgan_bt.Places(low, high, success_radius)
+    places.learn(origins, ends)                    # (n, T, goal_dim): where actions began and ended
+    places.refresh()
+    left, directions = places.ways(here, goals)    # a potential to shape rewards, and a heading
+
 Recall traces for agents of Stable-Baselines3 are in `goalgan_bt.sb3`. What a call can be given that
 makes no sense is a `goalgan_bt.UsageError`, a folder that is no run a `goalgan_bt.RunError`; both
 are `ValueError`s, as is a damaged file, and their message says what to do.
@@ -37,7 +44,8 @@ if TYPE_CHECKING:
     from goalgan_bt.learners.run_config import Trained
     from goalgan_bt.learners.trained_policy import TrainedPolicy, load_policy
     from goalgan_bt.recall.backtracking import BacktrackingModel
-    from goalgan_bt.recall.settings import BacktrackingConfig
+    from goalgan_bt.recall.places import Places, Ways
+    from goalgan_bt.recall.settings import BacktrackingConfig, PlacesConfig
     from goalgan_bt.recall.traces import Traces, recall_traces
     from goalgan_bt.runs.errors import RunError, UsageError
     from goalgan_bt.train import train
@@ -48,11 +56,14 @@ __all__ = [
     "GanConfig",
     "GoalCurriculum",
     "GoalsConfig",
+    "Places",
+    "PlacesConfig",
     "RunError",
     "Traces",
     "Trained",
     "TrainedPolicy",
     "UsageError",
+    "Ways",
     "load_policy",
     "recall_traces",
     "train",
@@ -65,11 +76,14 @@ _HOME = {
     "GanConfig": "curriculum.settings",
     "GoalCurriculum": "curriculum.curriculum",
     "GoalsConfig": "curriculum.settings",
+    "Places": "recall.places",
+    "PlacesConfig": "recall.settings",
     "RunError": "runs.errors",
     "Traces": "recall.traces",
     "Trained": "learners.run_config",
     "TrainedPolicy": "learners.trained_policy",
     "UsageError": "runs.errors",
+    "Ways": "recall.places",
     "load_policy": "learners.trained_policy",
     "recall_traces": "recall.traces",
 }

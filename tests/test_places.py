@@ -199,6 +199,8 @@ def test_what_is_no_state_of_places_is_refused():
         Places(LOW, HIGH, 0.3, CFG).load_state_dict(state | {"keys": state["keys"] - 10**6})
     with pytest.raises(ValueError):
         Places(LOW, HIGH, 0.3, CFG).load_state_dict(state | {"from": state["from"] + 10**6})
+    with pytest.raises(ValueError, match=r"another --places\.cell"):
+        Places(LOW, HIGH, 0.3, replace(CFG, cell=0.5)).load_state_dict(state)
     with pytest.raises(ValueError, match="finite"):
         count = torch.full_like(state["count"], torch.nan)
         Places(LOW, HIGH, 0.3, CFG).load_state_dict(state | {"count": count})

@@ -141,7 +141,10 @@ def preset(env: str, method: str | None = None) -> MazeConfig:
         # The box is 0.6 m thin: among its neighbours' outcomes a goal's own is lost, and noise
         # throws it out of the box. No walls to be misled by: `near` is not needed.
         goals = replace(cfg.goals, near=math.inf, label_rollouts=3, old=100, anywhere=0.1)
-        cfg = replace(cfg, goals=goals, gan=replace(cfg.gan, goal_noise=0.1, steps=100))
+        goals = replace(goals, frontier=0.0, imagined=1)
+        places = replace(cfg.places, cell=0.5, reach=1.2)  # or there are too many of them
+        gan = replace(cfg.gan, goal_noise=0.1, steps=100)
+        cfg = replace(cfg, goals=goals, places=places, gan=gan)
     return cfg if method is None else with_method(cfg, method)
 
 

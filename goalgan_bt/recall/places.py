@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
@@ -44,16 +44,21 @@ class Places:
     Args:
         low, high: (goal_dim,) the box of the goals, metres.
         success_radius: metres.
-        cfg: settings.
+        cfg: settings; those of the mazes if None.
 
     Attributes:
         places: (K, goal_dim) the places visited; moves: (K, K) how often each move was made.
     """
 
     def __init__(
-        self, low: FloatArray, high: FloatArray, success_radius: float, cfg: PlacesConfig
+        self,
+        low: ArrayLike,
+        high: ArrayLike,
+        success_radius: float,
+        cfg: PlacesConfig | None = None,
     ) -> None:
-        self.cfg, self._low, self._high = cfg, np.asarray(low, float), np.asarray(high, float)
+        self.cfg = cfg = cfg or PlacesConfig()
+        self._low, self._high = np.asarray(low, float), np.asarray(high, float)
         self._near = NEAR * success_radius
         # A point of the lattice has a number, its key; a step along axis i adds strides[i] to it.
         self._sides = np.ceil((self._high - self._low) / cfg.cell).astype(np.int64) + 2
@@ -158,6 +163,7 @@ class Places:
         """The places and the moves; ways follow from them."""
         moves = self.moves.tocoo()
         columns = {"keys": self._keys, "from": moves.row, "to": moves.col, "count": moves.data}
+        columns["lattice"] = np.array([*self._low, *self._high, self.cfg.cell])
         return {name: torch.from_numpy(np.asarray(column)) for name, column in columns.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -167,6 +173,8 @@ class Places:
             ValueError: if those are no places and moves.
         """
         keys, a, b, count = (state[name].numpy() for name in ("keys", "from", "to", "count"))
+        if not torch.equal(state["lattice"], self.state_dict()["lattice"]):
+            raise ValueError("its places are those of another box or of another --places.cell")
         if len(np.unique(keys)) < len(keys) or (keys // self._sides.prod()).any():
             raise ValueError("places visited are none of its lattice")
         if not np.isfinite(count).all():
