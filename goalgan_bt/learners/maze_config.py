@@ -103,7 +103,7 @@ ANT = MazeConfig(
     discount=0.993,
     gae_lambda=0.9,
     updates=4,
-    policy=PolicyConfig(init_std=0.2, final_std=0.07),
+    policy=PolicyConfig(init_std=0.2, final_std=0.07, settled=0.7),
     rollout=RolloutConfig(num_envs=256, steps=50),
     goals=GoalsConfig(frontier=1.4, imagined=4),
     gan=GanConfig(steps=50, generator_hidden=(128, 128)),
@@ -112,7 +112,7 @@ ANT = MazeConfig(
 )
 POINT = MazeConfig(
     env="point_umaze",
-    total_steps=4_000_000,
+    total_steps=2_000_000,
     action_repeat=4,
     discount=0.97,
     updates=8,
@@ -141,10 +141,12 @@ def preset(env: str, method: str | None = None) -> MazeConfig:
         # The box is 0.6 m thin: among its neighbours' outcomes a goal's own is lost, and noise
         # throws it out of the box. No walls to be misled by: `near` is not needed.
         goals = replace(cfg.goals, near=math.inf, label_rollouts=3, old=100, anywhere=0.1)
+        # What lies beyond the frontier has too many sides to be tried, and no way is longer than the
+        # straight line: traces of full states are what helps here.
         goals = replace(goals, frontier=0.0, imagined=1)
-        places = replace(cfg.places, cell=0.5, reach=1.2)  # or there are too many of them
-        gan = replace(cfg.gan, goal_noise=0.1, steps=100)
-        cfg = replace(cfg, goals=goals, places=places, gan=gan)
+        cfg = replace(cfg, goals=goals, places=replace(cfg.places, shaping=0.0, heading=False))
+        cfg = replace(cfg, imitation=replace(cfg.imitation, source="traces"))
+        cfg = replace(cfg, gan=replace(cfg.gan, goal_noise=0.1, steps=100))
     return cfg if method is None else with_method(cfg, method)
 
 
