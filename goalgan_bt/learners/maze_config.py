@@ -141,8 +141,8 @@ def preset(env: str, method: str | None = None) -> MazeConfig:
         # The box is 0.6 m thin: among its neighbours' outcomes a goal's own is lost, and noise
         # throws it out of the box. No walls to be misled by: `near` is not needed.
         goals = replace(cfg.goals, near=math.inf, label_rollouts=3, old=100, anywhere=0.1)
-        # What lies beyond the frontier has too many sides to be tried, and no way is longer than the
-        # straight line: traces of full states are what helps here.
+        # What lies beyond the frontier has too many sides to be tried, and all ways are straight:
+        # traces of full states are what helps here.
         goals = replace(goals, frontier=0.0, imagined=1)
         cfg = replace(cfg, goals=goals, places=replace(cfg.places, shaping=0.0, heading=False))
         cfg = replace(cfg, imitation=replace(cfg.imitation, source="traces"))
