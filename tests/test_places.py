@@ -135,7 +135,27 @@ def test_a_move_that_works_no_longer_is_forgotten_and_one_that_is_made_is_not():
 
 def test_goals_that_nobody_visited_are_reached_by_the_nearest_place():
     left, direction = way(walked(U), (0, 0), (-1, 3))
-    assert left == pytest.approx(10, rel=0.1) and direction @ (1, 0) > 0.98
+    assert left == pytest.approx(10 + math.sqrt(2), rel=0.05) and direction @ (1, 0) > 0.98
+
+
+def test_the_way_to_a_goal_beyond_all_that_is_known_gets_shorter_with_every_step():
+    places = walked(line((0, 0), (3, 0)), radius=1.0)
+    at = line((0, 0), (4.3, 0))
+    goals = np.tile((4.3, 0.0), (len(at), 1))
+    left, directions = places.ways(at, goals)
+    assert left[0] == pytest.approx(4.3, rel=0.05) and left[-1] == 0
+    assert -np.diff(left) == pytest.approx(np.full(len(at) - 1, 0.1), abs=0.03)
+    assert (directions[:-1, 0] > 0.98).all()
+
+
+def test_a_dead_end_beside_the_way_changes_nothing_about_it():
+    spur = line((2, 0), (2, -0.5))  # from where nobody came back
+    for back in (1.0, 3.0, math.inf):
+        cfg = replace(CFG, backward=back)
+        plain, other = walked(U, U[::-1], cfg=cfg), walked(U, U[::-1], spur, cfg=cfg)
+        at = line((0.5, 0), (3.5, 0))
+        goals = np.tile((0.0, 2.0), (len(at), 1))
+        assert other.ways(at, goals).left == pytest.approx(plain.ways(at, goals).left, abs=0.05)
 
 
 def test_a_goal_in_sight_is_where_one_sees_it_and_one_behind_a_wall_is_not():
@@ -168,7 +188,7 @@ def test_in_the_open_ways_are_nearly_straight_in_any_dimension(dim, n, cell):
     left, directions = places.ways(at, goals)
     straight = np.linalg.norm(goals - at, axis=1)
     far = straight > 1.0
-    assert np.median(left[far] / straight[far]) < 1.25
+    assert np.median(left[far] / straight[far]) < (1.25 if dim < 6 else 1.45)  # coarse there
     cosines = (directions * (goals - at)).sum(axis=1) / straight
     assert np.median(cosines[far]) > 0.9
 

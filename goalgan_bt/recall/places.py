@@ -27,6 +27,7 @@ from goalgan_bt.recall.settings import PlacesConfig
 
 Nodes = NDArray[np.int64]  # places by number, in the order in which they were found
 NEAR = 1.2  # success radii: a goal in sight and as near as that is where one sees it
+AROUND = 1.5  # times the straight line: a way that is longer leads around something
 ONCE = 0.5  # moves that count for less are forgotten
 
 
@@ -118,35 +119,41 @@ class Places:
         # zeros where no way is known, as at the last place, which is none.
         self._table = np.zeros((0, k + 1, 2 + dim), np.float32)
         self._row = np.full(k, -1)  # by the place nearest to the goal
-        self._asked, self._rows = np.empty(0, np.int64), np.empty(0, np.int64)  # by a goal's key
+        self._asked, self._ends = np.empty(0, np.int64), np.empty(0, np.int64)  # by a goal's key
         self._last: tuple[tuple[FloatArray, FloatArray], FloatArray] | None = None
         if goals is not None and len(a):
             self._rows_of(goals)
 
     def ways(self, places: FloatArray, goals: FloatArray) -> Ways:
-        """The ways from places to goals, both (n, goal_dim): those recalled, to and from the
-        nearest places visited, and straight lines as long as nothing is known."""
+        """The ways from places to goals, both (n, goal_dim): to the place visited that is nearest
+        to the goal, and straight on from there. Straight lines where nothing is known."""
         offsets = goals - places
         straight = np.sqrt(np.square(offsets).sum(axis=1))
         direct = offsets / np.maximum(straight, 1e-9)[:, None]
         if self.cfg.way == "straight" or not self._costs.nnz or not len(places):
             return Ways(straight, direct)
-        rows = self._rows_of(goals)
+        rows, ends = self._rows_of(goals)
         corners, weights = self._around(places)
         np.minimum(corners, self._table.shape[1] - 1, out=corners)  # new since the last refresh
         mean = np.einsum("nc,ncf->nf", weights, self._table[rows[:, None], corners])
-        if (lost := mean[:, 0] < 1e-6).any():
+        if (lost := mean[:, 0] < 1e-6).any():  # nobody has been at any corner
             away, nearest = self._tree.query(np.nan_to_num(places[lost]))
             mean[lost] = self._table[rows[lost], nearest]
             mean[lost, 1] += away
-        left = mean[:, 1] / np.maximum(mean[:, 0], 1e-9)
-        length = np.sqrt(np.square(mean[:, 2:]).sum(axis=1))
-        in_sight = lost | (left < 1.5 * straight + 2 * self.cfg.cell)
-        as_seen = (straight < self.cfg.cell) | (straight < self._near) & in_sight
-        as_seen |= ~(length > 1e-6)  # as where no way leads
-        left = np.where(as_seen, straight, left)
-        directions = mean[:, 2:] / np.maximum(length, 1e-6)[:, None]
-        return Ways(left, np.where(as_seen[:, None], direct, directions))
+        known = np.maximum(mean[:, 0], 1e-6)
+        recalled, last_leg = mean[:, 1] / known, goals - self.places[ends]
+        left = recalled + np.sqrt(np.square(last_leg).sum(axis=1))
+        along = recalled[:, None] * unit(mean[:, 2:]) + last_leg
+        # The goal is where one sees it: near and in sight, from the end of what is known, from
+        # beyond it, and where no way leads.
+        cell = self.cfg.cell
+        as_seen = (straight < self._near) & (left < AROUND * straight + 2 * cell)
+        as_seen |= (recalled < 2 * cell) | (straight < cell)
+        as_seen |= lost & (straight < left) | (mean[:, 0] < 1e-6)
+        turned = as_seen | ~(np.square(along).sum(axis=1) > 1e-12)
+        return Ways(
+            np.where(as_seen, straight, left), np.where(turned[:, None], direct, unit(along))
+        )
 
     def heading(self, places: FloatArray, goals: FloatArray) -> FloatArray:
         """Offsets from places to goals, (n, goal_dim) each, along the way: as far as the way is
@@ -237,32 +244,38 @@ class Places:
 
     # The ways.
 
-    def _rows_of(self, goals: FloatArray) -> Nodes:
-        """Rows of the table for goals, (n, goal_dim) -> (n,): those of the nearest places visited.
-        Which are missing are made."""
+    def _rows_of(self, goals: FloatArray) -> tuple[Nodes, Nodes]:
+        """Rows of the table for goals (n, goal_dim), and the nearest places visited, (n,) each.
+        Rows that are missing are made."""
         keys = self._keys_of(goals)
         at = np.minimum(np.searchsorted(self._asked, keys), len(self._asked) - 1)
         if not len(self._asked) or (self._asked[at] != keys).any():
             self._asked = np.union1d(self._asked, keys)
-            nearest = self._tree.query(self._points(self._asked))[1]
-            self._search(np.unique(nearest[self._row[nearest] < 0]))
-            self._rows = self._row[nearest]
+            self._ends = self._tree.query(self._points(self._asked))[1]
+            self._search(np.unique(self._ends[self._row[self._ends] < 0]))
             at = np.searchsorted(self._asked, keys)
-        return self._rows[at]
+        ends = self._ends[at]
+        return self._row[ends], ends
 
     def _search(self, ends: Nodes) -> None:
         """Unroll the moves backward from those places, and put what comes of it into the table."""
         if not len(ends):
             return
         left = dijkstra(self._costs.T, indices=ends)
-        with np.errstate(invalid="ignore"):
+        with np.errstate(invalid="ignore"):  # beside places from where no way leads there
             down = np.stack([-(slope @ left.T).T for slope in self._slopes], axis=2)
-            down /= np.maximum(np.sqrt(np.square(down).sum(axis=2, keepdims=True)), 1e-9)
         new = np.zeros((len(ends), *self._table.shape[1:]), np.float32)
-        new[:, :-1, 0], new[:, :-1, 1], new[:, :-1, 2:] = 1.0, left, down
-        new[~np.isfinite(new).all(axis=2)] = 0.0  # no way leads there, or to a neighbour
+        new[:, :-1, 0] = np.isfinite(left)
+        new[:, :-1, 1] = np.where(np.isfinite(left), left, 0.0)
+        new[:, :-1, 2:] = unit(np.where(np.isfinite(down).all(axis=2, keepdims=True), down, 0.0))
         self._row[ends] = len(self._table) + np.arange(len(ends))
         self._table = np.concatenate([self._table, new])
+
+
+def unit(vectors: FloatArray) -> FloatArray:
+    """Vectors (..., goal_dim) of length 1; zero stays zero."""
+    length = np.sqrt(np.square(vectors).sum(axis=-1, keepdims=True))
+    return np.asarray(vectors / np.maximum(length, 1e-9))
 
 
 def slopes(places: FloatArray, neighbours: csr_array) -> list[csr_array]:
