@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -8,6 +9,7 @@ from goalgan_bt.curriculum.settings import GoalsConfig
 from goalgan_bt.learners import maze_config
 from goalgan_bt.learners.maze_config import make_env
 from goalgan_bt.learners.maze_learner import MazeLearner
+from goalgan_bt.runs.errors import UsageError
 
 
 def test_label_edges_are_strict():
@@ -93,10 +95,10 @@ def test_a_goal_is_hopeless_once_all_tries_near_it_have_failed():
     assert not estimator.hopeless(everywhere).any()  # two are not enough
     estimator.add(here, np.zeros(1, dtype=bool))
     assert estimator.hopeless(everywhere).tolist() == [True, False, False]
-    estimator.add(here, np.ones(1, dtype=bool))
     estimator.add(far.repeat(3, axis=0), np.zeros(3, dtype=bool))
     assert estimator.hopeless(far).all()
-    assert estimator.hopeless(here + 0.01).tolist() in ([True], [False])  # whichever are nearest
+    estimator.add(np.array([[9.1, 0.0]]), np.ones(1, dtype=bool))  # the nearest three count
+    assert estimator.hopeless(np.array([[9.0, 0.0], [9.2, 0.0]])).tolist() == [True, False]
 
 
 def test_with_a_frontier_goals_are_tried_beyond_what_was_seen_until_they_fail_or_are_mastered():
@@ -144,3 +146,9 @@ def test_only_goals_near_visited_places_are_intermediate():
     curriculum.estimator.add(goals.repeat(5, axis=0), np.ones(15, dtype=bool))
     mapped = curriculum.mapped(np.array([[0.9, 0.0], [1.1, 0.0]]), reach=1.0)
     assert mapped.tolist() == [1.0, 0.0]
+
+
+def test_a_frontier_needs_the_places_visited():
+    for near, frontier in ((float("inf"), 1.0), (0.4, 0.3)):
+        with pytest.raises(UsageError, match="frontier must not be less than near"):
+            GoalCurriculum([0, 0], [1, 1], goals=GoalsConfig(near=near, frontier=frontier))

@@ -13,7 +13,7 @@ from goalgan_bt.agent.policy import GaussianPolicy
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.envs.mujoco_env import MujocoEnv
 from goalgan_bt.learners.maze_learner import load_policy
-from goalgan_bt.learners.trained_policy import world_of
+from goalgan_bt.learners.trained_policy import settings_of, world_of
 from goalgan_bt.runs.errors import RunError
 
 
@@ -61,7 +61,7 @@ class Player:
         torch.set_num_threads(1)  # the trainer needs the cores
         self._folder = folder
         goals = len(world_of(folder, 1)[1].test_goals())
-        self._cfg, self.env = world_of(folder, goals)
+        _, self.env = world_of(folder, goals)
         self._policy: GaussianPolicy | None = None
         self._tried: int | None = None  # the checkpoint last looked at, by its time
         self.iteration = 0
@@ -79,7 +79,8 @@ class Player:
             stamp = os.stat(path).st_mtime_ns
             if stamp != self._tried:
                 self._tried = stamp
-                self._policy, self.iteration = load_policy(self.env, self._cfg, self._folder)
+                cfg = settings_of(self._folder)  # a resumed run may have others
+                self._policy, self.iteration = load_policy(self.env, cfg, self._folder)
         except (OSError, RunError):
             pass  # none yet, or another version: the last one will do
         return self._policy is not None

@@ -42,7 +42,8 @@ class GoalsConfig:
     far beyond, metres, unless tries near it have all failed; r_min then counts for nothing (the
     original: 0)."""
     hopeless: Annotated[int, ABOVE_ZERO] = 5
-    """How many tries within `near` must have failed, and none succeeded, among the last 5,000."""
+    """How many of the nearest tries, all within `near`, must have failed: of the last 5,000, or of
+    `episodes` where those are more."""
     imagined: Annotated[int, ABOVE_ZERO] = 1
     """Goals imagined for each that is proposed: those of intermediate difficulty come first (the
     original: 1)."""
@@ -60,6 +61,8 @@ def conflicts(cfg: GoalsConfig) -> Iterator[tuple[str, str]]:
         yield "neighbours", "must not be more than episodes"
     if cfg.r_min >= cfg.r_max:
         yield "r_min", "must be less than r_max"
+    if cfg.frontier and cfg.frontier < cfg.near:
+        yield "frontier", "must not be less than near, or 0"
     if cfg.source == "gan_fit_all" and cfg.near == math.inf:
         yield "near", "must be finite for gan_fit_all, which needs to know the places visited"
 

@@ -187,6 +187,7 @@ def begin(learner: MazeLearner, env: GoalEnv, test_env: GoalEnv, run: Session) -
     collector.begin(anywhere)
     rollouts, episodes = collector.collect(learner.policy, anywhere)
     learner.remember(episodes)
+    learner.learn_places(rollouts)
     run.count("train", batch_steps(cfg))
     learner.policy.normaliser.update(flat(rollouts.obs))
     visited = collector.achieved_goals()
@@ -206,7 +207,8 @@ def propose(learner: MazeLearner, test_env: GoalEnv, run: Session) -> Goals:
     run.count("label", steps)
     remembered = learner.curriculum.recollect(learner.cfg.goals.old)
     goals = Goals(np.concatenate([imagined, remembered]), len(imagined))
-    learner.places.refresh(goals.all)
+    with run.clock.measure("learning"):
+        learner.places.refresh(goals.all)
     return goals
 
 
@@ -219,9 +221,7 @@ def practise(learner: MazeLearner, collector: Collector, goals: Goals, run: Sess
     with run.clock.measure("learning"):
         run.background.wait("value", "backtracking")
         learner.remember(episodes)
-        learner.places.learn(
-            *(ranks.gather(at.swapaxes(0, 1)) for at in (rollouts.origins, rollouts.achieved))
-        )
+        learner.learn_places(rollouts)
         run.background.start("backtracking", learner.fit_model)
     return Batch(rollouts, episodes)
 
@@ -278,8 +278,9 @@ def advantages_and_returns(
 
 def shaping(learner: MazeLearner, rollouts: Rollouts) -> Float32:
     """Reward for the way that each action has made shorter, (T, N): what is left before less what
-    is left after it (Ng, Harada and Russell 1999, without a discount: with it, standing still far
-    from the goal would pay). None for an action on which the body failed."""
+    is left after it. None for an action on which the body failed. That is the difference of Ng,
+    Harada and Russell's potentials (1999) without their discount, which would pay for standing
+    still far from the goal (docs/LOG.md)."""
     cfg, (steps, n, dim) = learner.cfg.places, rollouts.achieved.shape
     if not cfg.shaping:
         return np.zeros_like(rollouts.rewards)
@@ -398,7 +399,7 @@ def measure(
     if run.measures():
         with run.clock.measure("evaluation"):
             test_goals = test_env.test_goals()
-            learner.places.refresh(test_goals)  # as whoever loads the policy has them
+            learner.places.refresh()  # as whoever loads the policy has them
             measured, by_mean, steps = coverage(
                 test_env,
                 learner.policy,
@@ -466,7 +467,7 @@ def report(
     about_traces = {
         "traces": traces.valid.shape[1],
         "valid": mean(traces.valid),
-        **{f"valid_{n}": traces.survival(n // cfg.action_repeat) for n in DEPTHS},
+        **{f"valid_{n}": traces.survival(-(-n // cfg.action_repeat)) for n in DEPTHS},
         "decoded": len(seeds.goals) / max(1, wanted),
         "shift": mean(seeds.shift),
     }

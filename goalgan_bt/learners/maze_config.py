@@ -181,6 +181,8 @@ def check(cfg: MazeConfig) -> None:
         )
     if cfg.policy.final_std is not None and cfg.policy.final_std < cfg.policy.min_std:
         raise UsageError("--policy.final-std must not be less than --policy.min-std")
+    if places := cfg.places.problem():
+        raise UsageError(f"--places.{places[0]} {places[1]}")
     for name, wrong in conflicts(cfg.goals):
         raise UsageError(f"--goals.{name.replace('_', '-')} {wrong}")
     if cfg.backtracking.min_transitions > cfg.backtracking.buffer:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from goalgan_bt.agent.policy import GaussianPolicy, ValueFunction
-from goalgan_bt.agent.rollout import Episodes
+from goalgan_bt.agent.rollout import Episodes, Rollouts
 from goalgan_bt.curriculum.baselines import feasible, oracle
 from goalgan_bt.curriculum.curriculum import GoalCurriculum
 from goalgan_bt.envs.goal_env import GoalEnv
@@ -20,7 +20,7 @@ from goalgan_bt.recall.forward import ForwardModel
 from goalgan_bt.recall.imitation import Imitation
 from goalgan_bt.recall.places import Places
 from goalgan_bt.recall.transitions import Transitions
-from goalgan_bt.runs import checkpoint
+from goalgan_bt.runs import checkpoint, ranks
 from goalgan_bt.runs.errors import RunError
 
 SESSION = ("iteration", "steps", "seconds", "next_measurement")  # what a `Session` needs to go on
@@ -48,7 +48,8 @@ class MazeLearner:
             part: torch.Generator().manual_seed(seed)
             for part, seed in zip(NOISY, seeds, strict=True)
         }
-        self.places = recalled_places(env, cfg)
+        self.places = places_of(env, cfg)
+        env.heading = self.places.heading if cfg.places.heading else None
         sizes = env.state_dim, env.act_dim
         self.policy = GaussianPolicy(env.obs_dim, env.act_dim, cfg.policy)
         self.value = ValueFunction(env.obs_dim, cfg.value)
@@ -93,6 +94,13 @@ class MazeLearner:
         left = np.repeat(np.cumsum(lengths), lengths) - np.arange(lengths.sum()) - 1
         goals = np.repeat(goals, lengths, axis=0)
         self.transitions.add(episodes.states, episodes.actions, episodes.next_states, goals, left)
+
+    def learn_places(self, rollouts: Rollouts) -> None:
+        """Count the moves from place to place in the rollouts of all ranks, if anybody asks for
+        ways."""
+        if self.cfg.places.used:
+            steps = rollouts.origins, rollouts.achieved
+            self.places.learn(*(ranks.gather(at.swapaxes(0, 1)) for at in steps))
 
     def fit_model(self) -> dict[str, float]:
         """Let the model whose steps are imitated learn from the transitions."""
@@ -186,8 +194,8 @@ def load_policy(env: GoalEnv, cfg: MazeConfig, folder: Path) -> tuple[GaussianPo
     Raises:
         RunError: as `load`; the environment is left as it was.
     """
-    before = env.heading
-    places = recalled_places(env, cfg)
+    places, before = places_of(env, cfg), env.heading
+    env.heading = places.heading if cfg.places.heading else None  # the policy's size is with it
     try:
         policy = GaussianPolicy(env.obs_dim, env.act_dim, cfg.policy)
         with checkpoint.saved(folder) as state:
@@ -200,8 +208,6 @@ def load_policy(env: GoalEnv, cfg: MazeConfig, folder: Path) -> tuple[GaussianPo
     return policy, iteration
 
 
-def recalled_places(env: GoalEnv, cfg: MazeConfig) -> Places:
-    """Places for an environment, which gets their heading if the settings say so."""
-    places = Places(env.goal_low, env.goal_high, env.success_radius, cfg.places)
-    env.heading = places.heading if cfg.places.heading else None
-    return places
+def places_of(env: GoalEnv, cfg: MazeConfig) -> Places:
+    """Places for the goals of an environment."""
+    return Places(env.goal_low, env.goal_high, env.success_radius, cfg.places)

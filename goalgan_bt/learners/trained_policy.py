@@ -20,9 +20,8 @@ from goalgan_bt.runs.errors import RunError, UsageError
 from goalgan_bt.runs.run_folder import maze_of
 
 
-def world_of(folder: Path, num_envs: int) -> tuple[MazeConfig, GoalEnv]:
-    """The settings of a run and simulations of its world, on MuJoCo, where the run may have been on
-    mujoco-warp.
+def settings_of(folder: Path) -> MazeConfig:
+    """The settings of a run, on MuJoCo, where it may have been on mujoco-warp.
 
     Raises:
         RunError: if the folder is no run of a maze.
@@ -30,7 +29,16 @@ def world_of(folder: Path, num_envs: int) -> tuple[MazeConfig, GoalEnv]:
     cfg = load(folder)
     if not isinstance(cfg, MazeConfig):
         raise RunError(f"{folder} is a run of {cfg.env}, no maze: nothing of it can be loaded here")
-    cfg = replace(cfg, threads=1, physics="mujoco", device="auto", resume=None)
+    return replace(cfg, threads=1, physics="mujoco", device="auto", resume=None)
+
+
+def world_of(folder: Path, num_envs: int) -> tuple[MazeConfig, GoalEnv]:
+    """The settings of a run and simulations of its world.
+
+    Raises:
+        RunError: if the folder is no run of a maze.
+    """
+    cfg = settings_of(folder)
     return cfg, make_env(cfg, num_envs, maze_of(folder))
 
 

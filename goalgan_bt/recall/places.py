@@ -1,14 +1,15 @@
 """A backtracking model over places: from which places has the agent come to this one?
 
 The paper's q(s_t | s_t+1) (Recall Traces, section 2.1) over places instead of full states, by
-counting, as it counts in four rooms: a place is a point of a lattice in the goal space, and counted
-are the moves from place to place that the agent has made. Unrolled backward from a goal, along the
-shortest moves, it tells for every place that the agent has been to the way that is left to that
-goal, and the direction in which it gets shorter. A body that loses energy in contacts cannot be
+counting, as one can in four rooms: a place is a point of a lattice in the goal space, and counted
+are the moves from place to place that the agent has made. Where q is not zero, a move may have led
+here. Unrolled backward from a goal along those moves, the shortest way first, it tells for every
+place that the agent has been to the way that is left to that goal, and the direction in which it
+gets shorter. A body that loses energy in contacts cannot be
 unrolled backward over its full states for long; over places it can, all the way to the start.
 
-The way that is left is a potential of the agent's own making (Ng, Harada and Russell 1999), and the
-direction a part of what the policy sees: the two uses of it in `PlacesConfig`.
+The way that is left is a potential of the agent's own making (after Ng, Harada and Russell 1999),
+and the direction a part of what the policy sees: the two uses of it in `PlacesConfig`.
 """
 
 import math
@@ -24,9 +25,13 @@ from torch import Tensor
 
 from goalgan_bt.envs.maze import FloatArray
 from goalgan_bt.recall.settings import PlacesConfig
+from goalgan_bt.runs.errors import UsageError
+from goalgan_bt.runs.ranges import require
 
 Nodes = NDArray[np.int64]  # places by number, in the order in which they were found
 NEAR = 1.2  # success radii: a goal in sight and as near as that is where one sees it
+MOST = 20_000_000  # ways in memory: 16 bytes each in two dimensions
+AT_ONCE = 1_000_000  # of which so many are searched at a time
 AROUND = 1.5  # times the straight line: a way that is longer leads around something
 ONCE = 0.5  # moves that count for less are forgotten
 
@@ -49,6 +54,9 @@ class Places:
 
     Attributes:
         places: (K, goal_dim) the places visited; moves: (K, K) how often each move was made.
+
+    Raises:
+        UsageError: for a box that is none, or settings that make no sense.
     """
 
     def __init__(
@@ -60,6 +68,7 @@ class Places:
     ) -> None:
         self.cfg = cfg = cfg or PlacesConfig()
         self._low, self._high = np.asarray(low, float), np.asarray(high, float)
+        check(self._low, self._high, cfg)
         self._near = NEAR * success_radius
         # A point of the lattice has a number, its key; a step along axis i adds strides[i] to it.
         self._sides = np.ceil((self._high - self._low) / cfg.cell).astype(np.int64) + 2
@@ -77,7 +86,15 @@ class Places:
         Args:
             origins, ends: (n, T, goal_dim) where each action began and ended. Where one begins
                 elsewhere than the last one ended, another episode has begun.
+
+        Raises:
+            UsageError: for arrays that do not fit.
         """
+        if origins.ndim != 3 or origins.shape != ends.shape or origins.shape[2] != len(self._low):
+            raise UsageError(
+                f"origins and ends must be (n, T, {len(self._low)}), as many of both, "
+                f"not {origins.shape} and {ends.shape}"
+            )
         self._visit(np.concatenate([origins, ends]).reshape(-1, len(self._low)))
         begun, ended = self._find(self._keys_of(origins)), self._find(self._keys_of(ends))
         episode = np.zeros(begun.shape, np.int64)
@@ -95,7 +112,8 @@ class Places:
         self.moves.resize((k, k))
         if self.cfg.forget:
             actions = np.bincount(begun[begun >= 0], minlength=k)
-            self.moves = csr_array(diags_array(np.exp2(-actions / self.cfg.forget)) @ self.moves)
+            fading = diags_array(np.exp2(-actions / self.cfg.forget))
+            self.moves = csr_array(fading @ self.moves @ fading)
             self.moves.data[self.moves.data < ONCE] = 0.0
             self.moves.eliminate_zeros()
         self.moves = csr_array(self.moves + csr_array((np.ones(len(a)), (a, b)), shape=(k, k)))
@@ -250,6 +268,9 @@ class Places:
         keys = self._keys_of(goals)
         at = np.minimum(np.searchsorted(self._asked, keys), len(self._asked) - 1)
         if not len(self._asked) or (self._asked[at] != keys).any():
+            if (len(self._table) + len(keys)) * len(self) > MOST:  # anew, of what is asked now
+                self._asked, self._table = self._asked[:0], self._table[:0]
+                self._row[:] = -1
             self._asked = np.union1d(self._asked, keys)
             self._ends = self._tree.query(self._points(self._asked))[1]
             self._search(np.unique(self._ends[self._row[self._ends] < 0]))
@@ -259,17 +280,34 @@ class Places:
 
     def _search(self, ends: Nodes) -> None:
         """Unroll the moves backward from those places, and put what comes of it into the table."""
-        if not len(ends):
-            return
-        left = dijkstra(self._costs.T, indices=ends)
-        with np.errstate(invalid="ignore"):  # beside places from where no way leads there
-            down = np.stack([-(slope @ left.T).T for slope in self._slopes], axis=2)
         new = np.zeros((len(ends), *self._table.shape[1:]), np.float32)
-        new[:, :-1, 0] = np.isfinite(left)
-        new[:, :-1, 1] = np.where(np.isfinite(left), left, 0.0)
-        new[:, :-1, 2:] = unit(np.where(np.isfinite(down).all(axis=2, keepdims=True), down, 0.0))
+        some = max(1, AT_ONCE // max(1, len(self)))
+        for begin in range(0, len(ends), some):
+            rows = slice(begin, begin + some)
+            left = dijkstra(self._costs.T, indices=ends[rows])
+            with np.errstate(invalid="ignore"):  # beside places from where no way leads there
+                down = np.stack([-(slope @ left.T).T for slope in self._slopes], axis=2)
+            down[~np.isfinite(down).all(axis=2)] = 0.0
+            new[rows, :-1, 0] = np.isfinite(left)
+            new[rows, :-1, 1] = np.where(np.isfinite(left), left, 0.0)
+            new[rows, :-1, 2:] = unit(down)
         self._row[ends] = len(self._table) + np.arange(len(ends))
         self._table = np.concatenate([self._table, new])
+
+
+def check(low: FloatArray, high: FloatArray, cfg: PlacesConfig) -> None:
+    """Refuse what makes no sense.
+
+    Raises:
+        UsageError: naming it.
+    """
+    require(cfg)
+    if problem := cfg.problem():
+        raise UsageError(" ".join(problem))
+    if low.ndim != 1 or low.shape != high.shape or not (low < high).all() or not len(low):
+        raise UsageError(f"low and high must be the corners of a box, not {low} and {high}")
+    if np.prod(np.ceil((high - low) / cfg.cell) + 2) > 2**62:
+        raise UsageError(f"a cell of {cfg.cell} divides that box too finely")
 
 
 def unit(vectors: FloatArray) -> FloatArray:
@@ -291,7 +329,9 @@ def slopes(places: FloatArray, neighbours: csr_array) -> list[csr_array]:
     steps = places[b] - places[a]
     spread = np.zeros((k, dim, dim))
     np.add.at(spread, a, steps[:, :, None] * steps[:, None, :])
-    spread += 1e-6 * np.eye(dim)  # neighbours in a row have a slope along it only
+    spread += (
+        1e-6 * spread.max(initial=1e-12) * np.eye(dim)
+    )  # neighbours in a row have a slope along it only
     weights = np.linalg.solve(spread[a], steps[:, :, None])[:, :, 0]
     matrices = []
     for column in weights.T:

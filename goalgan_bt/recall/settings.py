@@ -6,7 +6,7 @@ Apart from the code that reads them, so that a command line answers before torch
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from goalgan_bt.runs.ranges import ABOVE_ZERO, ABOVE_ZERO_OR_INFINITE, NOT_NEGATIVE, Range, faults
+from goalgan_bt.runs.ranges import ABOVE_ZERO, NOT_NEGATIVE, Range, faults
 
 MOST_RECALLED = 1_000_000  # steps at a time: beyond it memory, not sense, is the limit
 
@@ -85,7 +85,8 @@ class PlacesConfig:
     """Reward for each metre by which the way that is left gets shorter, beside the true reward; 0
     is off. Labels and coverage never see it."""
     heading: bool = True
-    """Tell the policy the direction in which the way gets shorter, beside that of the goal."""
+    """Tell the policy the offset to the goal along the way, beside the straight one: as far as the
+    way is long, in the direction in which it begins."""
     way: Literal["recalled", "straight"] = "recalled"
     """The way that is left: recalled from the moves made, or the straight line (a control)."""
     cell: Annotated[float, ABOVE_ZERO] = 0.25
@@ -93,13 +94,26 @@ class PlacesConfig:
     reach: Annotated[float, ABOVE_ZERO] = 0.6
     """Length of a move at most, metres."""
     lags: Annotated[tuple[int, ...], ABOVE_ZERO] = (1, 2, 5, 10, 20)
-    """Actions that a move takes."""
-    backward: Annotated[float, ABOVE_ZERO_OR_INFINITE] = 3.0
+    """Actions that a move takes; longer ones than a batch has are left out."""
+    backward: Annotated[float, Range("1 or more", 1, endless=True)] = 3.0
     """How many times its length a move costs the other way, where it was made one way only: 1
     takes it for possible, inf for impossible."""
     forget: Annotated[float, NOT_NEGATIVE] = 0.0
-    """After so many actions from where a move begins it counts half as much, and less than half a
-    move is forgotten: one that works no longer; 0 forgets none."""
+    """After so many actions from either of its ends a move counts half as much, and less than half
+    a move is forgotten: one that works no longer is not made again; 0 forgets none."""
+
+    @property
+    def used(self) -> bool:
+        """Whether anybody asks for recalled ways."""
+        return self.way == "recalled" and (self.shaping > 0 or self.heading)
+
+    def problem(self) -> tuple[str, str] | None:
+        """What does not go together: a setting and what is wrong with it."""
+        if not self.lags:
+            return "lags", "must name at least one number of actions"
+        if self.reach < self.cell:
+            return "reach", "must not be less than cell: no move would reach another place"
+        return None
 
 
 @dataclass(frozen=True)
