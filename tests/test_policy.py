@@ -1,5 +1,4 @@
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -49,10 +48,6 @@ def test_the_std_stays_between_its_bounds():
         assert policy(obs)[1].exp().item() == pytest.approx(std)
     policy.log_std.data.fill_(math.log(1e-3))
     assert policy(obs)[1].exp().item() == pytest.approx(0.05)
-    early = GaussianPolicy(2, 1, replace(cfg, settled=0.5))
-    for progress, std in ((0.25, 0.3), (0.5, 0.1), (1.0, 0.1)):
-        early.cap_std(progress)
-        assert early(obs)[1].exp().item() == pytest.approx(std)
     free = GaussianPolicy(2, 1, PolicyConfig(hidden=(4,), init_std=0.5))
     free.cap_std(1.0)
     free.log_std.data.fill_(1.0)

@@ -79,8 +79,7 @@ class GaussianPolicy(nn.Module):
     def cap_std(self, progress: float) -> None:
         """Set the bound on the standard deviation for this progress in the run, 0 to 1."""
         first, last = self.cfg.init_std, self.cfg.final_std
-        share = min(progress / self.cfg.settled, 1.0)
-        cap = math.inf if last is None else first + share * (last - first)
+        cap = math.inf if last is None else first + min(progress, 1.0) * (last - first)
         self.max_std.fill_(cap)
 
     def bounded_log_std(self) -> Tensor:

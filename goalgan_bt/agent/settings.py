@@ -22,10 +22,8 @@ class PolicyConfig:
     min_std: Annotated[float, ABOVE_ZERO] = 0.05
     """The standard deviation never falls below this."""
     final_std: Annotated[float | None, ABOVE_ZERO] = None
-    """If given, the standard deviation is bounded by a line from init_std to this; once on the line
-    it follows it."""
-    settled: Annotated[float, SHARE_ABOVE_ZERO] = 1.0
-    """Share of the run at which that line ends."""
+    """If given, the standard deviation is bounded by a line from init_std to this over the run;
+    once on the line it follows it."""
 
 
 @dataclass(frozen=True)

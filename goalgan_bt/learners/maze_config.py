@@ -103,7 +103,7 @@ ANT = MazeConfig(
     discount=0.993,
     gae_lambda=0.9,
     updates=4,
-    policy=PolicyConfig(init_std=0.2, final_std=0.07, settled=0.7),
+    policy=PolicyConfig(init_std=0.2, final_std=0.07),
     rollout=RolloutConfig(num_envs=256, steps=50),
     goals=GoalsConfig(frontier=1.4, imagined=4),
     gan=GanConfig(steps=50, generator_hidden=(128, 128)),

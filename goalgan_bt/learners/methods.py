@@ -14,7 +14,6 @@ ALONE = {
     "goals.frontier": 0.0,
     "goals.imagined": 1,
     "gae_lambda": 0.95,
-    "policy.settled": 1.0,
     "imitation.source": "none",
 }
 TRACES = ALONE | {"imitation.source": "traces"}  # recall traces of full states, nothing over places
