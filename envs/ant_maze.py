@@ -84,7 +84,7 @@ class AntMaze(MazeEnv):
         achieved = self.achieved_goals(states) if achieved is None else achieved
         along = self.along(achieved, goals)
         offset = self.squashed(along)
-        states = renumbered(states, quarter_turns(states, self._target(states, goals, along)))
+        states = renumbered(states, self._turns(states, goals, along))
         along_x, _, along_z = axes_on_map(states[:, 3:7])
         front = along_x / (_length(along_x) + 1e-9)
         velocity = states[:, 15:17]
@@ -106,14 +106,12 @@ class AntMaze(MazeEnv):
     def from_body(self, actions: Array, states: Array, goals: Array) -> Array:
         return _renumber_actions(actions, self._turns(states, goals))
 
-    def _turns(self, states: Array, goals: Array) -> Array:
-        """By how many quarter turns each front is off its way, (n,)."""
-        along = None if self.heading is None else self.along(self.achieved_goals(states), goals)
-        return quarter_turns(states, self._target(states, goals, along))
-
-    def _target(self, states: Array, goals: Array, along: Array | None) -> Array:
-        """What the fronts shall point at, (n, 2)."""
-        return goals if self.heading is None else states[:, :2] + along
+    def _turns(self, states: Array, goals: Array, along: Array | None = None) -> Array:
+        """By how many quarter turns to the left each front is off its way, (n,)."""
+        if self.heading is None:  # from the torso: no need of the centre of mass
+            return quarter_turns(states, goals)
+        along = self.along(self.achieved_goals(states), goals) if along is None else along
+        return quarter_turns(states, states[:, :2] + along)
 
     def achieved_goals(self, states: Array) -> Array:
         """Centre of mass of the whole Ant, (n, 2): what MuJoCo calls the torso's subtree_com.

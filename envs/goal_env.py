@@ -240,3 +240,14 @@ class GoalEnv:
         truncated = ~terminated & (elapsed >= self.horizon)
         rewards = xp.asarray(success, dtype=xp.float32)
         return Step(states, achieved, actions, rewards, terminated, truncated)
+
+
+def observed(env: GoalEnv, states: Array, goals: Array) -> Array:
+    """What a point sees, or a body like it, whose state begins with its place: the state, the
+    offset to the desired goal and, where there is a heading, the squashed offset along the way;
+    (n, obs_dim) float32."""
+    xp, place = namespace(states), states[:, : env.goal_dim]
+    parts = [states, goals - place]
+    if env.heading is not None:
+        parts.append(env.squashed(env.along(place, goals)))
+    return xp.asarray(xp.concat(parts, axis=1), dtype=xp.float32)

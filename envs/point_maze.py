@@ -12,10 +12,9 @@ import mujoco
 import numpy as np
 
 from goalgan_bt.envs.arrays import Array, namespace, put
-from goalgan_bt.envs.goal_env import Ids
+from goalgan_bt.envs.goal_env import Ids, observed
 from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
 from goalgan_bt.envs.mujoco_env import INTEGRATORS, MazeEnv, add_walls
-from goalgan_bt.envs.point_nd import observed
 
 RADIUS = 0.1  # m
 
@@ -44,7 +43,7 @@ def build_model(maze: Maze, integrator: str) -> mujoco.MjModel:
 class PointMaze(MazeEnv):
     """Reach any point of a maze by pushing; success within 0.3 m.
 
-    State: x, y (m), vx, vy (m/s). Observation: see `point_nd.observed`. Achieved goal: x, y.
+    State: x, y (m), vx, vy (m/s). Observation: see `goal_env.observed`. Achieved goal: x, y.
     """
 
     success_radius = 0.3

@@ -7,8 +7,8 @@ dimensions, the fewer goals are feasible (20% in two, then 0.06 times that per d
 
 import numpy as np
 
-from goalgan_bt.envs.arrays import Array, namespace
-from goalgan_bt.envs.goal_env import GoalEnv, Ids
+from goalgan_bt.envs.arrays import Array
+from goalgan_bt.envs.goal_env import GoalEnv, Ids, observed
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 
 MAX_FORCE = 2.0  # m/s^2 per axis, at action 1
@@ -17,20 +17,10 @@ GOAL_RANGE = 5.0  # m, goals are proposed in +- this on every axis
 DT = 0.02  # s
 
 
-def observed(env: GoalEnv, states: Array, goals: Array) -> Array:
-    """What a point sees: its state, the offset to the desired goal and, where there is a heading,
-    the squashed offset along the way; 3 or 4 numbers per dimension."""
-    xp, place = namespace(states), states[:, : env.goal_dim]
-    parts = [states, goals - place]
-    if env.heading is not None:
-        parts.append(env.squashed(env.along(place, goals)))
-    return xp.asarray(xp.concat(parts, axis=1), dtype=xp.float32)
-
-
 class PointND(GoalEnv):
     """Reach any point of the box; success within 0.3 sqrt(dim / 2) m.
 
-    State: positions (m), velocities (m/s). Observation: see `observed`. Achieved goal: the
+    State: positions (m), velocities (m/s). Observation: see `goal_env.observed`. Achieved goal: the
     position.
     """
 

@@ -20,13 +20,13 @@ def learn(folder, *flags):
 @pytest.mark.parametrize("seed", ["0", "1"])
 def test_the_point_learns_most_of_the_umaze(tmp_path, seed):
     coverage = learn(tmp_path / "run", "--env", "point_umaze", "--seed", seed)
-    assert max(coverage) >= 0.8
+    assert coverage[-1] >= 0.9
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_the_default_beats_uniform_goals_on_the_same_budget(tmp_path):
-    """In the mean of three seeds: over the run (0.53 to 0.19) as at its end (0.67 to 0.25)."""
+    """In the mean of three seeds: over the run as at its end."""
     budget = "--env", "point_umaze", "--total-steps", "600000", "--coverage.every", "100000"
     found = {}
     for method in ("recall_traces", "uniform"):
@@ -40,6 +40,6 @@ def test_the_default_beats_uniform_goals_on_the_same_budget(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_the_ant_learns_to_walk_around_the_first_corner(tmp_path):
+def test_the_ant_learns_to_walk_around_both_corners(tmp_path):
     coverage = learn(tmp_path / "run", "--env", "ant_umaze", "--total-steps", "4000000")
-    assert coverage[-1] >= 0.38 > 0.25 > coverage[0]
+    assert coverage[-1] >= 0.6 > 0.25 > coverage[0]
