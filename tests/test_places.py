@@ -149,6 +149,13 @@ def test_the_way_to_a_goal_beyond_all_that_is_known_gets_shorter_with_every_step
     assert (directions[:-1, 0] > 0.98).all()
 
 
+def test_off_the_beaten_track_the_way_is_that_from_the_nearest_place_visited():
+    """Nothing is gained by leaving it: a wall may be what keeps everybody from there."""
+    off, direction = way(walked(U), (1.0, 0.5), (0, 2))
+    assert off == pytest.approx(way(walked(U), (1.0, 0.0), (0, 2))[0] + 0.5, abs=0.1)
+    assert direction @ (1, 0) > 0.98
+
+
 def test_a_dead_end_beside_the_way_changes_nothing_about_it():
     spur = line((2, 0), (2, -0.5))  # from where nobody came back
     for back in (1.0, 3.0, math.inf):
