@@ -107,9 +107,12 @@ def test_one_and_two_ranks_make_the_same_update(tmp_path):
     ):
         for key in ours.keys() - {"_extra_state"}:
             assert torch.allclose(ours[key], theirs[key], atol=1e-3, rtol=1e-3), key
-    assert len(one["places"]["keys"]) > 10 and len(one["places"]["count"]) > 20
-    for name, ours in one["places"].items():  # the same places, and as many moves between them
-        assert torch.equal(ours, two["places"][name]), name
+    ours, theirs = moves_of(one["places"]), moves_of(two["places"])
+    # Rounding puts a body on the other side of a border between two places now and then.
+    apart = sum(
+        abs(ours.get(move, 0) - theirs.get(move, 0)) for move in ours.keys() | theirs.keys()
+    )
+    assert len(ours) > 100 and apart < 0.02 * sum(ours.values())
     seen = one["curriculum"]["estimator"], two["curriculum"]["estimator"]
     assert len(seen[0]["goals"]) > 0
     assert torch.allclose(seen[0]["goals"], seen[1]["goals"], atol=1e-3)
@@ -120,6 +123,15 @@ def test_one_and_two_ranks_make_the_same_update(tmp_path):
     moved = (one["policy"]["net.flat"] - fresh.policy.net.flat.detach()).abs().max()
     apart = (one["policy"]["net.flat"] - two["policy"]["net.flat"]).abs()
     assert apart.max() < 0.01 * moved
+
+
+def moves_of(places):
+    """How often each move was made, by the places that it joins."""
+    names = places["keys"].tolist()
+    ends = zip(places["from"].tolist(), places["to"].tolist(), strict=True)
+    return {
+        (names[a], names[b]): n for (a, b), n in zip(ends, places["count"].tolist(), strict=True)
+    }
 
 
 @pytest.mark.parametrize("victim", [0, 1])

@@ -338,7 +338,7 @@ def test_a_full_disk_is_one_line(tmp_path):
 def test_help_shows_defaults_of_the_preset():
     done = call("train", "--env", "point_umaze", "--help")
     assert done.returncode == 0
-    assert "4000000" in done.stdout and "--backtracking.trace-length" in done.stdout
+    assert "2000000" in done.stdout and "--backtracking.trace-length" in done.stdout
 
 
 def test_in_a_terminal_the_page_stays_until_ctrl_c(tmp_path):
