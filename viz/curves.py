@@ -8,6 +8,7 @@ import viser
 from viser import uplot
 
 from goalgan_bt.envs.maze import FloatArray
+from goalgan_bt.recall.settings import DEPTHS
 from goalgan_bt.study.published import published
 from goalgan_bt.viz.run import Run
 
@@ -69,7 +70,7 @@ PLOTS = (
     ),
     Plot(
         "Recall traces still valid so many steps before the goal",
-        tuple((f"backtracking/valid_{n}", str(n)) for n in (10, 20, 50)),
+        tuple((f"backtracking/valid_{n}", str(n)) for n in DEPTHS),
         share=True,
     ),
     Plot(

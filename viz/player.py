@@ -14,6 +14,7 @@ from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.envs.mujoco_env import MujocoEnv
 from goalgan_bt.learners.maze_learner import load_policy
 from goalgan_bt.learners.trained_policy import settings_of, world_of
+from goalgan_bt.recall.places import unit
 from goalgan_bt.runs.errors import RunError
 
 
@@ -113,8 +114,7 @@ class Player:
         places = self.env.test_goals()
         if self.env.heading is None:
             return places[:0], places[:0]
-        along = self.env.heading(places, np.repeat(goal, len(places), axis=0))
-        return places, along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+        return places, unit(self.env.heading(places, np.repeat(goal, len(places), axis=0)))
 
     def some_goal(self) -> FloatArray:
         """A feasible goal at random, (1, goal_dim)."""

@@ -160,8 +160,9 @@ class Collector:
         late_goals: list[FloatArray] = [np.empty((0, env.goal_dim))]
         ended: list[tuple[np.ndarray, ...]] = []  # Episodes' columns, with ids before them
         paths: list[tuple[int, Float32, Float32]] = []
-        achieved = env.achieved_goals(env.read_states(ids))
-        obs = env.observe(ids)
+        states = env.read_states(ids)
+        achieved = env.achieved_goals(states)
+        obs = env.observations(states, env.goals, achieved)
         for t in range(steps):
             actions = act(obs, noise[t])
             self._obs[t], self._sampled[t] = obs, actions

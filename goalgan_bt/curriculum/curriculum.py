@@ -28,7 +28,7 @@ from goalgan_bt.curriculum.settings import GanConfig, GoalsConfig, conflicts
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.runs import checkpoint
 from goalgan_bt.runs.errors import UsageError
-from goalgan_bt.runs.ranges import require, require_whole
+from goalgan_bt.runs.ranges import require, require_box, require_whole
 
 SIDE = 10.0  # metres, of the papers' goal box, for which the default distances are made
 WORLDLY = ("feasible", "oracle")  # sources of goals that a curriculum alone does not have
@@ -75,7 +75,7 @@ class GoalCurriculum:
         rng: np.random.Generator | None = None,
         noise: torch.Generator | None = None,
     ) -> None:
-        self.low, self.high = _box(low, high)
+        self.low, self.high = require_box(low, high)
         dim = len(self.low)
         self._unit, self._centre = np.ones(dim), np.zeros(dim)
         if goals is None:  # inside, the box is a cube of 10 m around zero
@@ -375,20 +375,3 @@ def _check(seed: int, every: int, goals: GoalsConfig, gan: GanConfig) -> None:
         require(settings)
     for name, problem in conflicts(goals):
         raise UsageError(f"{name} {problem}")
-
-
-def _box(low: ArrayLike, high: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """The corners of a box as arrays.
-
-    Raises:
-        UsageError: if they are none.
-    """
-    corners = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
-    shapes = corners[0].shape, corners[1].shape
-    if shapes[0] != shapes[1] or len(shapes[0]) != 1 or not shapes[0][0]:
-        raise UsageError(f"low and high must be the corners of a box, not of shapes {shapes}")
-    with np.errstate(over="ignore"):
-        finite = np.isfinite([*corners, corners[1] - corners[0]]).all()
-    if not (finite and (corners[0] < corners[1]).all()):
-        raise UsageError("low must be less than high in every dimension, and both finite")
-    return corners

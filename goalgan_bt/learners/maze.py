@@ -27,6 +27,7 @@ from goalgan_bt.learners.run_config import Trained, World
 from goalgan_bt.recall.consistency import consistency
 from goalgan_bt.recall.decoder import Decoded, decode
 from goalgan_bt.recall.forward import imagine
+from goalgan_bt.recall.settings import DEPTHS
 from goalgan_bt.recall.traces import Traces, recall_traces
 from goalgan_bt.recall.transitions import Steps
 from goalgan_bt.runs import ranks
@@ -40,7 +41,6 @@ ANYWHERE = 1000  # goals of the first batch, uniform in the box
 FRAME_TRACES = 64  # traces kept in a frame
 FRAME_PATHS = 32  # simulations whose paths are kept in a frame
 SEED_STATES = 2000  # experienced states among which the decoder looks
-DEPTHS = 10, 20, 50  # steps before the goal at which it is told how many traces still are valid
 KL_SAMPLE = 1024  # observations on which imitation's KL is bounded
 
 
@@ -398,12 +398,11 @@ def measure(
     measured = None
     if run.measures():
         with run.clock.measure("evaluation"):
-            test_goals = test_env.test_goals()
             learner.places.refresh()  # as whoever loads the policy has them
             measured, by_mean, steps = coverage(
                 test_env,
                 learner.policy,
-                test_goals,
+                test_env.test_goals(),
                 learner.cfg.coverage.rollouts,
                 learner.noise["evaluation"],
             )

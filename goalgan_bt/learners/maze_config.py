@@ -143,10 +143,13 @@ def preset(env: str, method: str | None = None) -> MazeConfig:
         goals = replace(cfg.goals, near=math.inf, label_rollouts=3, old=100, anywhere=0.1)
         # What lies beyond the frontier has too many sides to be tried, and all ways are straight:
         # traces of full states are what helps here.
-        goals = replace(goals, frontier=0.0, imagined=1)
-        cfg = replace(cfg, goals=goals, places=replace(cfg.places, shaping=0.0, heading=False))
-        cfg = replace(cfg, imitation=replace(cfg.imitation, source="traces"))
-        cfg = replace(cfg, gan=replace(cfg.gan, goal_noise=0.1, steps=100))
+        cfg = replace(
+            cfg,
+            goals=replace(goals, frontier=0.0, imagined=1),
+            gan=replace(cfg.gan, goal_noise=0.1, steps=100),
+            places=replace(cfg.places, shaping=0.0, heading=False),
+            imitation=replace(cfg.imitation, source="traces"),
+        )
     return cfg if method is None else with_method(cfg, method)
 
 
@@ -181,8 +184,8 @@ def check(cfg: MazeConfig) -> None:
         )
     if cfg.policy.final_std is not None and cfg.policy.final_std < cfg.policy.min_std:
         raise UsageError("--policy.final-std must not be less than --policy.min-std")
-    if places := cfg.places.problem():
-        raise UsageError(f"--places.{places[0]} {places[1]}")
+    if problem := cfg.places.problem():
+        raise UsageError(f"--places.{problem}")
     for name, wrong in conflicts(cfg.goals):
         raise UsageError(f"--goals.{name.replace('_', '-')} {wrong}")
     if cfg.backtracking.min_transitions > cfg.backtracking.buffer:

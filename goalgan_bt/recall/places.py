@@ -5,8 +5,8 @@ counting, as one can in four rooms: a place is a point of a lattice in the goal 
 are the moves from place to place that the agent has made. Where q is not zero, a move may have led
 here. Unrolled backward from a goal along those moves, the shortest way first, it tells for every
 place that the agent has been to the way that is left to that goal, and the direction in which it
-gets shorter. A body that loses energy in contacts cannot be
-unrolled backward over its full states for long; over places it can, all the way to the start.
+gets shorter. A body that loses energy in contacts cannot be unrolled backward over its full states
+for long; over places it can, all the way to the start.
 
 The way that is left is a potential of the agent's own making (after Ng, Harada and Russell 1999),
 and the direction a part of what the policy sees: the two uses of it in `PlacesConfig`.
@@ -26,7 +26,7 @@ from torch import Tensor
 from goalgan_bt.envs.maze import FloatArray
 from goalgan_bt.recall.settings import PlacesConfig
 from goalgan_bt.runs.errors import UsageError
-from goalgan_bt.runs.ranges import require
+from goalgan_bt.runs.ranges import require, require_box
 
 Nodes = NDArray[np.int64]  # places by number, in the order in which they were found
 NEAR = 1.2  # success radii: a goal in sight and as near as that is where one sees it
@@ -67,11 +67,10 @@ class Places:
         cfg: PlacesConfig | None = None,
     ) -> None:
         self.cfg = cfg = cfg or PlacesConfig()
-        self._low, self._high = np.asarray(low, float), np.asarray(high, float)
-        check(self._low, self._high, cfg)
+        self._low, self._high = require_box(low, high)
         self._near = NEAR * success_radius
         # A point of the lattice has a number, its key; a step along axis i adds strides[i] to it.
-        self._sides = np.ceil((self._high - self._low) / cfg.cell).astype(np.int64) + 2
+        self._sides = lattice(self._low, self._high, cfg)
         self._strides = np.concatenate([[1], np.cumprod(self._sides[:-1])])
         self.moves = csr_array((0, 0))
         self._number(np.empty(0, np.int64))
@@ -294,19 +293,19 @@ class Places:
         self._table = np.concatenate([self._table, new])
 
 
-def check(low: FloatArray, high: FloatArray, cfg: PlacesConfig) -> None:
-    """Refuse what makes no sense.
+def lattice(low: FloatArray, high: FloatArray, cfg: PlacesConfig) -> NDArray[np.int64]:
+    """How many points the lattice has along each side of a box, (goal_dim,).
 
     Raises:
-        UsageError: naming it.
+        UsageError: for settings that make no sense, or make it too fine.
     """
     require(cfg)
     if problem := cfg.problem():
-        raise UsageError(" ".join(problem))
-    if low.ndim != 1 or low.shape != high.shape or not (low < high).all() or not len(low):
-        raise UsageError(f"low and high must be the corners of a box, not {low} and {high}")
-    if np.prod(np.ceil((high - low) / cfg.cell) + 2) > 2**62:
+        raise UsageError(problem)
+    sides = np.ceil((high - low) / cfg.cell) + 2
+    if np.prod(sides) > 2**62:
         raise UsageError(f"a cell of {cfg.cell} divides that box too finely")
+    return sides.astype(np.int64)
 
 
 def unit(vectors: FloatArray) -> FloatArray:
@@ -328,9 +327,8 @@ def slopes(places: FloatArray, neighbours: csr_array) -> list[csr_array]:
     steps = places[b] - places[a]
     spread = np.zeros((k, dim, dim))
     np.add.at(spread, a, steps[:, :, None] * steps[:, None, :])
-    spread += (
-        1e-6 * spread.max(initial=1e-12) * np.eye(dim)
-    )  # neighbours in a row have a slope along it only
+    # Neighbours in a row have a slope along it only.
+    spread += 1e-6 * spread.max(initial=1e-12) * np.eye(dim)
     weights = np.linalg.solve(spread[a], steps[:, :, None])[:, :, 0]
     matrices = []
     for column in weights.T:

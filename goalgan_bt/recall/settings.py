@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from goalgan_bt.runs.ranges import ABOVE_ZERO, NOT_NEGATIVE, Range, faults
 
+DEPTHS = 10, 20, 50  # steps before the goal at which it is told how many traces still are valid
 MOST_RECALLED = 1_000_000  # steps at a time: beyond it memory, not sense, is the limit
 
 
@@ -107,12 +108,12 @@ class PlacesConfig:
         """Whether anybody asks for recalled ways."""
         return self.way == "recalled" and (self.shaping > 0 or self.heading)
 
-    def problem(self) -> tuple[str, str] | None:
-        """What does not go together: a setting and what is wrong with it."""
+    def problem(self) -> str | None:
+        """What does not go together in these settings, if anything does not."""
         if not self.lags:
-            return "lags", "must name at least one number of actions"
+            return "lags must name at least one number of actions"
         if self.reach < self.cell:
-            return "reach", "must not be less than cell: no move would reach another place"
+            return "reach must not be less than cell: no move would reach another place"
         return None
 
 

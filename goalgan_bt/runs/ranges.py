@@ -14,8 +14,12 @@ from dataclasses import dataclass, fields, is_dataclass
 from numbers import Integral, Real
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 from goalgan_bt.runs.errors import UsageError
 
+Corner = NDArray[np.floating]
 SANE = 1e12  # no count, length or rate of ours is larger
 
 
@@ -84,6 +88,25 @@ def require_whole(name: str, number: Any, least: int) -> None:
     """
     if isinstance(number, bool) or not isinstance(number, Integral) or number < least:
         raise UsageError(f"{name} must be a whole number from {least} on, not {number!r}")
+
+
+def require_box(low: ArrayLike, high: ArrayLike) -> tuple[Corner, Corner]:
+    """The corners of a box as arrays.
+
+    Raises:
+        UsageError: if they are none.
+    """
+    corners = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
+    shapes = corners[0].shape, corners[1].shape
+    if shapes[0] != shapes[1] or len(shapes[0]) != 1 or not shapes[0][0]:
+        raise UsageError(f"low and high must be the corners of a box, not of shapes {shapes}")
+    with np.errstate(over="ignore"):
+        finite = np.isfinite([*corners, corners[1] - corners[0]]).all()
+    if not (finite and (corners[0] < corners[1]).all()):
+        raise UsageError(
+            "low must be less than high in every dimension, and both finite, to be corners of a box"
+        )
+    return corners
 
 
 def _problem(hint: Any, value: Any) -> str | None:
