@@ -31,10 +31,10 @@ TINY = (
     "--rollout.num-envs 32 --rollout.steps 40 --horizon 120 --backtracking.min-transitions 200 "
     "--coverage.rollouts 1 --coverage.every 3000 --gan.steps 20 --threads 1 --viz none "
 )
-POINT = f"--env point_umaze {TINY} --iterations 4 --goals.near 1"
+POINT = f"--env point_umaze {TINY} --iterations 4 --goals.near 0.7"
 ROOMS = "--env four_rooms_11 --total-steps 30000"
 HOPPER = "--env hopper --backtracking.min-steps 100 --episodes 1"
-ANT = f"--env ant_umaze {TINY} --iterations 2 --goals.near 3"
+ANT = f"--env ant_umaze {TINY} --iterations 2 --goals.near 1.4"
 LATE = "--imitation.fade 2"  # in so short a run nothing would be imitated, else
 COMMANDS = {  # name -> flags of goalgan_bt.train
     "point": POINT,
