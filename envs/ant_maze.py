@@ -60,11 +60,17 @@ class AntMaze(MazeEnv):
     The Ant looks the same after a quarter turn with its legs renumbered. The policy sees it, and
     moves it, in the one of the four equal numberings whose front points most nearly along the way
     to the goal (at the goal where there is no heading): what it learns about walking one way holds
-    for all. Observation, 39 numbers: qpos and qvel so numbered, then the offset from the centre of
-    mass to the goal along the way; the front's direction; the offset and the velocity along the
-    front and to its left; and the lean of the torso. With a heading the straight offset follows.
-    Offsets are squashed: the Ant walks towards goals which it has never reached as it does to
-    nearer ones.
+    for all. Offsets are squashed: the Ant walks towards goals which it has never reached as it does
+    to nearer ones.
+
+    Observation with a heading, 29 numbers: height, joint angles, vertical speed, spin and joint
+    velocities, so numbered; then along the front and to its left the straight offset from the
+    centre of mass to the goal, the offset along the way, the velocity, and the lean of the torso.
+    With a way to follow the Ant need not know where in the maze it is, so what it learns at one
+    place holds for all (docs/LOG.md).
+
+    Without one, 39: qpos and qvel so numbered; the straight offset; the front's direction; then
+    along the front and to its left the same offset, the velocity and the lean.
     """
 
     success_radius = 1.0
@@ -79,25 +85,29 @@ class AntMaze(MazeEnv):
         first = self.model.body("front_left_leg").id  # upper leg (fixed), lower leg, foot
         self._leg_share, self._foot_share = (mass[first + 1 : first + 3] / mass.sum()).tolist()
 
+    @property
+    def obs_dim(self) -> int:
+        """Size of an observation."""
+        return self.own_obs_dim if self.heading is None else 29
+
     def observations(self, states: Array, goals: Array, achieved: Array | None = None) -> Array:
         xp = namespace(states)
         achieved = self.achieved_goals(states) if achieved is None else achieved
         along = self.along(achieved, goals)
-        offset = self.squashed(along)
         states = renumbered(states, self._turns(states, goals, along))
         along_x, _, along_z = axes_on_map(states[:, 3:7])
         front = along_x / (_length(along_x) + 1e-9)
-        velocity = states[:, 15:17]
+        straight, offset = self.squashed(goals - achieved), self.squashed(along)
         shape = (len(states), self.obs_dim)
         obs = xp.empty(shape, dtype=xp.float32, device=states.device)
-        obs[:, :29] = states
-        obs[:, 29:31] = offset
-        obs[:, 31:33] = front
-        obs[:, 33], obs[:, 34] = _ahead_and_left(offset, front)
-        obs[:, 35], obs[:, 36] = _ahead_and_left(velocity, front)
-        obs[:, 37], obs[:, 38] = _ahead_and_left(along_z, front)
-        if self.heading is not None:
-            obs[:, 39:] = self.squashed(goals - achieved)
+        if self.heading is None:
+            obs[:, :29], obs[:, 29:31], obs[:, 31:33] = states, straight, front
+        else:
+            obs[:, 0], obs[:, 1:9], obs[:, 9:21] = states[:, 2], states[:, 7:15], states[:, 17:]
+            obs[:, 21], obs[:, 22] = _ahead_and_left(straight, front)
+        obs[:, -6], obs[:, -5] = _ahead_and_left(offset, front)
+        obs[:, -4], obs[:, -3] = _ahead_and_left(states[:, 15:17], front)
+        obs[:, -2], obs[:, -1] = _ahead_and_left(along_z, front)
         return obs
 
     def to_body(self, actions: Array, states: Array, goals: Array) -> Array:

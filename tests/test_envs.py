@@ -293,16 +293,19 @@ def to_the_left(places, goals):
 
 def test_with_a_heading_the_ant_faces_the_way_and_still_sees_where_the_goal_is():
     env, states, goals = ant_states()
-    plain = env.observations(states, goals)
     env.heading = to_the_left
     obs = env.observations(states, goals)
-    assert obs.shape == (len(states), env.obs_dim) == (len(states), 41)
+    assert obs.shape == (len(states), env.obs_dim) == (len(states), 29)
     offset = goals - env.achieved_goals(states)
-    assert np.allclose(obs[:, 39:], plain[:, 29:31], atol=1e-6)  # the straight offset
     along = to_the_left(0 * offset, offset)
-    length = np.linalg.norm(along, axis=1, keepdims=True)
-    assert np.allclose(obs[:, 29:31], along / (1 + length), atol=1e-6)
-    ahead, left = obs[:, 33:35].T
+    # The straight offset and twice as far to the left of it, each squashed, in the Ant's frame.
+    straight, way = obs[:, 21:23], obs[:, 23:25]
+    far = np.linalg.norm(offset, axis=1)
+    assert np.allclose(np.linalg.norm(straight, axis=1), far / (1 + far), atol=1e-6)
+    assert np.allclose(np.linalg.norm(way, axis=1), 2 * far / (1 + 2 * far), atol=1e-6)
+    turned = np.stack([-straight[:, 1], straight[:, 0]], axis=1) / far[:, None]
+    assert np.allclose(turned * (1 + far)[:, None], way * ((1 + 2 * far) / (2 * far))[:, None])
+    ahead, left = way.T
     assert (ahead > 0).all() and (np.abs(left) < ahead + 0.1).all()
     actions = np.random.default_rng(1).uniform(-1, 1, (len(states), 8))
     there = env.to_body(actions, states, goals)
@@ -311,6 +314,26 @@ def test_with_a_heading_the_ant_faces_the_way_and_still_sees_where_the_goal_is()
     assert np.allclose(
         there, ant_maze._renumber_actions(actions, -ant_maze.quarter_turns(states, turned))
     )
+
+
+def test_with_a_heading_the_ant_is_told_the_same_wherever_it_is_and_whichever_way_it_faces():
+    env, states, goals = ant_states()
+    env.heading = to_the_left
+    obs = env.observations(states, goals)
+    plain = env.observations(states + np.eye(29)[0], goals + (1.0, 0.0))
+    assert np.allclose(plain, obs, atol=1e-5)
+    angle = 1.234  # the world turned to the left about the start
+    cos, sin = np.cos(angle), np.sin(angle)
+    turn = np.array([[cos, sin], [-sin, cos]])
+    turned = states.copy()
+    turned[:, :2], turned[:, 15:17] = states[:, :2] @ turn, states[:, 15:17] @ turn
+    half_cos, half_sin = np.cos(angle / 2), np.sin(angle / 2)
+    w, x, y, z = states[:, 3:7].T
+    turned[:, 3] = half_cos * w - half_sin * z
+    turned[:, 4] = half_cos * x - half_sin * y
+    turned[:, 5] = half_cos * y + half_sin * x
+    turned[:, 6] = half_cos * z + half_sin * w
+    assert np.allclose(env.observations(turned, goals @ turn), obs, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["point_umaze", "point_nd"])

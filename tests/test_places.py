@@ -149,11 +149,16 @@ def test_the_way_to_a_goal_beyond_all_that_is_known_gets_shorter_with_every_step
     assert (directions[:-1, 0] > 0.98).all()
 
 
-def test_off_the_beaten_track_the_way_is_that_from_the_nearest_place_visited():
-    """Nothing is gained by leaving it: a wall may be what keeps everybody from there."""
-    off, direction = way(walked(U), (1.0, 0.5), (0, 2))
-    assert off == pytest.approx(way(walked(U), (1.0, 0.0), (0, 2))[0] + 0.5, abs=0.1)
-    assert direction @ (1, 0) > 0.98
+def test_where_nobody_has_been_the_way_is_the_straight_line_until_somebody_has():
+    """There may be a short cut. If there is none, whoever looked has seen that."""
+    off = (1.0, 0.5)
+    left, direction = way(walked(U), off, (0, 2))
+    assert left == pytest.approx(math.hypot(1, 1.5))
+    assert direction == pytest.approx(np.array([-1, 1.5]) / left)
+    there_and_back = line((1, 0), off, (1, 0))
+    left, direction = way(walked(U, there_and_back), off, (0, 2))
+    assert left == pytest.approx(way(walked(U), (1.0, 0.0), (0, 2))[0] + 0.5, abs=0.25)
+    assert direction @ (0, -1) > 0.6
 
 
 def test_a_dead_end_beside_the_way_changes_nothing_about_it():

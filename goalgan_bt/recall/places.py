@@ -153,19 +153,14 @@ class Places:
         corners, weights = self._around(places)
         np.minimum(corners, self._table.shape[1] - 1, out=corners)  # new since the last refresh
         mean = np.einsum("nc,ncf->nf", weights, self._table[rows[:, None], corners])
-        away = np.zeros(len(places))
-        if (lost := mean[:, 0] < 1e-6).any():  # nobody has been at any corner
-            away[lost], nearest = self._tree.query(np.nan_to_num(places[lost]))
-            mean[lost] = self._table[rows[lost], nearest]
         recalled, last_leg = mean[:, 1] / np.maximum(mean[:, 0], 1e-6), goals - self.places[ends]
-        arrived = recalled < 2 * self.cfg.cell  # at the end of what is known
-        recalled += away
         left = recalled + np.sqrt(np.square(last_leg).sum(axis=1))
         along = recalled[:, None] * unit(mean[:, 2:]) + last_leg
-        # The goal is where one sees it: near and in sight, from there on, and where no way leads.
+        # The goal is where one sees it: near and in sight, from the end of what is known on, and
+        # where no way leads or nobody has been (optimism, which finds short cuts).
         cell = self.cfg.cell
         as_seen = (straight < self._near) & (left < AROUND * straight + 2 * cell)
-        as_seen |= arrived | (straight < cell) | (mean[:, 0] < 1e-6)
+        as_seen |= (recalled < 2 * cell) | (straight < cell) | (mean[:, 0] < 1e-6)
         turned = as_seen | ~(np.square(along).sum(axis=1) > 1e-12)
         return Ways(
             np.where(as_seen, straight, left), np.where(turned[:, None], direct, unit(along))
