@@ -320,7 +320,7 @@ def test_with_a_heading_the_ant_is_told_the_same_wherever_it_is_and_whichever_wa
     env, states, goals = ant_states()
     env.heading = to_the_left
     obs = env.observations(states, goals)
-    plain = env.observations(states + np.eye(29)[0], goals + (1.0, 0.0))
+    plain = env.observations(states + np.eye(29)[0], goals + np.eye(2)[0])
     assert np.allclose(plain, obs, atol=1e-5)
     angle = 1.234  # the world turned to the left about the start
     cos, sin = np.cos(angle), np.sin(angle)
