@@ -66,8 +66,6 @@ class AntMaze(MazeEnv):
     Observation with a heading, 29 numbers: height, joint angles, vertical speed, spin and joint
     velocities, so numbered; then along the front and to its left the straight offset from the
     centre of mass to the goal, the offset along the way, the velocity, and the lean of the torso.
-    With a way to follow the Ant need not know where in the maze it is, so what it learns at one
-    place holds for all (docs/LOG.md).
 
     Without one, 39: qpos and qvel so numbered; the straight offset; the front's direction; then
     along the front and to its left the same offset, the velocity and the lean.
@@ -75,7 +73,6 @@ class AntMaze(MazeEnv):
 
     success_radius = 1.0
     act_dim = 8
-    own_obs_dim = 39
     model_of = staticmethod(build_model)
     start_state = np.array([0, 0, 0.55, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1] + [0] * 14, float)
 
@@ -88,7 +85,7 @@ class AntMaze(MazeEnv):
     @property
     def obs_dim(self) -> int:
         """Size of an observation."""
-        return self.own_obs_dim if self.heading is None else 29
+        return 39 if self.heading is None else 29
 
     def observations(self, states: Array, goals: Array, achieved: Array | None = None) -> Array:
         xp = namespace(states)

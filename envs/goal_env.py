@@ -56,10 +56,10 @@ class GoalEnv:
         action_repeat: steps for which each action is held. Success, failure and the end of time
             are checked after each action; all counts are of steps.
         success_radius: metres.
-        act_dim, goal_dim, state_dim: sizes of one row; own_obs_dim: of an observation without a
-            heading.
-        heading: tells offsets to goals along the way, where somebody knows the ways; observations
-            then have goal_dim numbers more.
+        act_dim, goal_dim, state_dim, obs_dim: sizes of one row.
+        heading: tells offsets to goals along the way, where somebody knows the ways. Observations
+            then hold these, and not where the body is: with a way to follow it need not know, and
+            what it learns at one place holds for all (docs/LOG.md).
         start_state: (state_dim,) where episodes begin.
         goal_low, goal_high: (goal_dim,) the box in which goals are proposed, metres.
         maze: the layout, or None where there are no walls.
@@ -70,7 +70,6 @@ class GoalEnv:
     dt: float
     success_radius: float
     act_dim: int
-    own_obs_dim: int
     start_state: FloatArray
     goal_low: FloatArray
     goal_high: FloatArray
@@ -92,8 +91,8 @@ class GoalEnv:
 
     @property
     def obs_dim(self) -> int:
-        """Size of an observation."""
-        return self.own_obs_dim + (0 if self.heading is None else self.goal_dim)
+        """Size of an observation; that of `observed`."""
+        return self.state_dim + self.goal_dim
 
     @property
     def state_dim(self) -> int:
@@ -243,11 +242,10 @@ class GoalEnv:
 
 
 def observed(env: GoalEnv, states: Array, goals: Array) -> Array:
-    """What a point sees, or a body like it, whose state begins with its place: the state, the
-    offset to the desired goal and, where there is a heading, the squashed offset along the way;
-    (n, obs_dim) float32."""
+    """What a point sees, or a body like it, whose state begins with its place: the state and the
+    offset to the desired goal; with a heading the squashed offset along the way in place of its
+    own; (n, obs_dim) float32."""
     xp, place = namespace(states), states[:, : env.goal_dim]
-    parts = [states, goals - place]
-    if env.heading is not None:
-        parts.append(env.squashed(env.along(place, goals)))
-    return xp.asarray(xp.concat(parts, axis=1), dtype=xp.float32)
+    offset, rest = goals - place, states[:, env.goal_dim :]
+    way = place if env.heading is None else env.squashed(env.along(place, goals))
+    return xp.asarray(xp.concat([way, rest, offset], axis=1), dtype=xp.float32)

@@ -48,7 +48,6 @@ class PointMaze(MazeEnv):
 
     success_radius = 0.3
     act_dim = 2
-    own_obs_dim = 6
     model_of = staticmethod(build_model)
     start_state = np.zeros(4)
 

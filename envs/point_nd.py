@@ -30,7 +30,7 @@ class PointND(GoalEnv):
     def __init__(self, dim: int, num_envs: int, horizon: int, action_repeat: int) -> None:
         self.bound = np.array(([1.0, 5.0] + [0.3] * dim)[:dim])
         self.success_radius = 0.3 * np.sqrt(dim / 2)
-        self.act_dim, self.own_obs_dim = dim, 3 * dim
+        self.act_dim = dim
         self.start_state = np.zeros(2 * dim)
         self.goal_low, self.goal_high = np.full(dim, -GOAL_RANGE), np.full(dim, GOAL_RANGE)
         super().__init__(num_envs, horizon, action_repeat)

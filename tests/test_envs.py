@@ -337,15 +337,16 @@ def test_with_a_heading_the_ant_is_told_the_same_wherever_it_is_and_whichever_wa
 
 
 @pytest.mark.parametrize("name", ["point_umaze", "point_nd"])
-def test_with_a_heading_a_point_sees_the_way_beside_the_goal(name):
+def test_with_a_heading_a_point_sees_the_way_and_not_where_it_is(name):
     env = envs.make(name, 1)
     states = np.array([[0.1, 0.2, 1.0, -1.0]])
     goals = np.array([[3.1, 4.2]])
     plain = env.observations(states, goals)
+    assert plain.shape == (1, env.obs_dim) and np.allclose(plain, [0.1, 0.2, 1, -1, 3, 4])
     env.heading = to_the_left
     obs = env.observations(states, goals)
-    assert obs.shape == (1, env.obs_dim) == (1, 8) and np.allclose(obs[:, :6], plain)
-    assert np.allclose(obs[0, 6:], np.array([-8.0, 6.0]) / 10.3, atol=1e-6)  # 10 m, within 0.3
+    way = np.array([-8.0, 6.0]) / 10.3  # 10 m, within 0.3
+    assert obs.shape == (1, env.obs_dim) and np.allclose(obs, [*way, 1, -1, 3, 4], atol=1e-6)
 
 
 def test_a_heading_is_asked_for_tensors_too():
