@@ -141,13 +141,13 @@ def preset(env: str, method: str | None = None) -> MazeConfig:
         # The box is 0.6 m thin: among its neighbours' outcomes a goal's own is lost, and noise
         # throws it out of the box. No walls to be misled by: `near` is not needed.
         goals = replace(cfg.goals, near=math.inf, label_rollouts=3, old=100, anywhere=0.1)
-        # What lies beyond the frontier has too many sides to be tried, and all ways are straight:
-        # traces of full states are what helps here.
+        # What lies beyond the frontier has too many sides to be tried. All ways are straight, and
+        # traces of full states help to go them.
         cfg = replace(
             cfg,
             goals=replace(goals, frontier=0.0, imagined=1),
             gan=replace(cfg.gan, goal_noise=0.1, steps=100),
-            places=replace(cfg.places, shaping=0.0, heading=False),
+            places=replace(cfg.places, way="straight"),
             imitation=replace(cfg.imitation, source="traces"),
         )
     return cfg if method is None else with_method(cfg, method)
