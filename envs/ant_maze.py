@@ -131,9 +131,10 @@ class AntMaze(MazeEnv):
         hip, ankle = states[:, 7:15:2], states[:, 8:15:2]  # (n, 4) rad
         weight = self._leg_share / 2 + self._foot_share * (1 + xp.cos(ankle))
         cos, sin = weight * xp.cos(hip), weight * xp.sin(hip)
-        x = cos @ legs[:, 0] - sin @ legs[:, 1]
-        y = sin @ legs[:, 0] + cos @ legs[:, 1]
-        z = self._foot_share * (xp.sin(ankle) @ lift)
+        # Sums of products, and no matrix products: those round differently in other batches.
+        x = (cos * legs[:, 0] - sin * legs[:, 1]).sum(axis=1)
+        y = (sin * legs[:, 0] + cos * legs[:, 1]).sum(axis=1)
+        z = self._foot_share * (xp.sin(ankle) * lift).sum(axis=1)
         along_x, along_y, along_z = axes_on_map(states[:, 3:7])
         com = along_x * x[:, None] + along_y * y[:, None] + along_z * z[:, None]
         return states[:, :2] + com

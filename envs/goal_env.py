@@ -141,6 +141,10 @@ class GoalEnv:
         """Whether each goal lies where the body can be, (n,)."""
         raise NotImplementedError
 
+    def free_goals(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Goals drawn uniformly from all that are feasible, (n, goal_dim)."""
+        raise NotImplementedError
+
     def test_goals(self) -> FloatArray:
         """The feasible goals over which coverage is measured, (K, goal_dim)."""
         raise NotImplementedError

@@ -99,6 +99,9 @@ class MazeEnv(MujocoEnv):
     def feasible(self, goals: Array) -> Array:
         return self.maze.is_free(goals)
 
+    def free_goals(self, n: int, rng: np.random.Generator) -> FloatArray:
+        return self.maze.sample_free(n, rng)
+
     def test_goals(self) -> FloatArray:
         return self.maze.tiles()
 

@@ -67,6 +67,9 @@ class PointND(GoalEnv):
     def feasible(self, goals: FloatArray) -> BoolArray:
         return np.asarray((np.abs(goals) <= self.bound).all(axis=1))
 
+    def free_goals(self, n: int, rng: np.random.Generator) -> FloatArray:
+        return rng.uniform(-self.bound, self.bound, (n, self.goal_dim))
+
     def test_goals(self) -> FloatArray:
         # The original draws 50 anew each time; fixed goals make two measurements comparable.
-        return np.random.default_rng(0).uniform(-self.bound, self.bound, (100, self.goal_dim))
+        return self.free_goals(100, np.random.default_rng(0))
