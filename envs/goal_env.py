@@ -205,17 +205,20 @@ class GoalEnv:
         return self.observations(self.read_states(ids), self.goals[ids])
 
     def step(self, ids: Ids, actions: FloatArray) -> Step:
-        """Take one action, `action_repeat` steps long, in some simulations.
+        """Take one action of a policy, `action_repeat` steps long, in some simulations.
 
         Args:
             ids: sorted indices of the simulations, (n,).
             actions: (n, act_dim), clipped to [-1, 1].
         """
-        goals = self.goals[ids]
-        actions = self.to_body(np.clip(actions, -1.0, 1.0), self.read_states(ids), goals)
+        said = np.clip(actions, -1.0, 1.0)
+        return self.step_body(ids, self.to_body(said, self.read_states(ids), self.goals[ids]))
+
+    def step_body(self, ids: Ids, actions: Array) -> Step:
+        """The same with what the body shall do, (n, act_dim) in [-1, 1] (see `to_body`)."""
         self.advance(ids, actions)
         self.elapsed[ids] += self.action_repeat
-        states = self.read_states(ids)
+        states, goals = self.read_states(ids), self.goals[ids]
         return self.judge(states, actions, goals, self._feasible[ids], self.elapsed[ids])
 
     def reached(self, achieved: Array, goals: Array) -> Array:

@@ -103,6 +103,11 @@ def action_space(env: GoalEnv) -> spaces.Box:
     return spaces.Box(-1.0, 1.0, (env.act_dim,), dtype=np.float32)
 
 
+def clipped(actions: NDArray[np.float32]) -> FloatArray:
+    """Actions within their bounds."""
+    return np.clip(np.asarray(actions, dtype=float), -1.0, 1.0)
+
+
 def begin(
     env: GoalEnv, options: dict[str, Any] | None, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
@@ -217,8 +222,9 @@ class GoalGymEnv(Rules, gymnasium.Env[Any, Any]):
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[dict[str, FloatArray], float, bool, bool, dict[str, Any]]:
-        """Take one action; `info` has `success`, the same as `is_success`, and `healthy`."""
-        step = self.sims.step(ONE, np.asarray(action, dtype=float)[None])
+        """Take one action, which is what the motors do. `info` has `success`, the same as
+        `is_success`, and `healthy`."""
+        step = self.sims.step_body(ONE, clipped(action)[None])
         if self.render_mode == "human":
             self.render()
         success, terminated = bool(step.rewards[0] > 0), bool(step.terminated[0])

@@ -19,6 +19,7 @@ from goalgan_bt.envs.gymnasium_env import (
     action_space,
     begin,
     check_render_mode,
+    clipped,
 )
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.envs.picture import Picture
@@ -145,7 +146,7 @@ class GoalVectorEnv(Rules, gymnasium.vector.VectorEnv[Obs, NDArray[np.float32], 
         success, healthy = np.zeros(self.num_envs, dtype=bool), np.ones(self.num_envs, dtype=bool)
         terminated, truncated = np.zeros((2, self.num_envs), dtype=bool)
         if len(moved):
-            step = self.sims.step(moved, np.asarray(actions, dtype=float)[moved])
+            step = self.sims.step_body(moved, clipped(actions)[moved])
             success[moved] = step.rewards > 0
             terminated[moved], truncated[moved] = step.terminated, step.truncated
             healthy[moved] = ~step.terminated | success[moved]

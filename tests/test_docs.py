@@ -92,6 +92,12 @@ def test_every_documented_plot_is_drawn(words, folder, tmp_path):
     assert call("plot", *filled(words, folder), "--out", out).returncode == 0 and out.exists()
 
 
+@pytest.mark.parametrize("words", [w for w in of("evaluate") if w])
+def test_every_documented_evaluation_is_made(words, folder):
+    done = call("evaluate", *filled(words, folder), "--episodes", "8")
+    assert done.returncode == 0 and "in 8 episodes" in done.stdout, done.stderr
+
+
 @pytest.mark.parametrize("words", [w for w in of("viz") if w])
 def test_every_documented_page_is_understood(words, folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -32,13 +32,13 @@ def settings_of(folder: Path) -> MazeConfig:
     return replace(cfg, threads=1, physics="mujoco", device="auto", resume=None)
 
 
-def world_of(folder: Path, num_envs: int) -> tuple[MazeConfig, GoalEnv]:
-    """The settings of a run and simulations of its world.
+def world_of(folder: Path, num_envs: int, threads: int = 1) -> tuple[MazeConfig, GoalEnv]:
+    """The settings of a run and simulations of its world, by so many threads (0: one per core).
 
     Raises:
         RunError: if the folder is no run of a maze.
     """
-    cfg = settings_of(folder)
+    cfg = replace(settings_of(folder), threads=threads)
     return cfg, make_env(cfg, num_envs, maze_of(folder))
 
 

@@ -1,0 +1,163 @@
+"""How well a trained policy does, in its own world or in an environment of Gymnasium's."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import stats
+
+from goalgan_bt.agent.coverage import attempts
+from goalgan_bt.envs.goal_env import GoalEnv
+from goalgan_bt.envs.maze import BoolArray, FloatArray
+from goalgan_bt.learners.maze_learner import load_policy
+from goalgan_bt.learners.trained_policy import TrainedPolicy, world_of
+from goalgan_bt.runs.errors import UsageError
+
+SIDE_BY_SIDE = 512  # simulations
+PER_GOAL = 3  # episodes for each test goal where no number is given
+ON = 100  # episodes elsewhere where no number is given
+
+
+class Attempted(NamedTuple):
+    """n episodes: success, fell: (n,) bool; seconds: (n,) how long each took."""
+
+    success: BoolArray
+    fell: BoolArray
+    seconds: FloatArray
+
+
+def at_home(
+    folder: Path, episodes: int | None, deterministic: bool, seed: int, threads: int
+) -> dict[str, Any]:
+    """Try the test goals of the run's own world, as coverage is measured, and tell what came of it.
+
+    Args:
+        folder: the run folder; its last checkpoint counts.
+        episodes: in all, spread evenly over the test goals; three for each if None.
+        deterministic: without the noise of exploration.
+        seed: of that noise.
+        threads: simulation threads, 0 for one per core.
+
+    Raises:
+        RunError: if the folder is no run of a maze, or has no checkpoint that can be read.
+    """
+    cfg, env = world_of(folder, SIDE_BY_SIDE, threads)
+    policy, iteration = load_policy(env, cfg, folder)
+    tested = env.test_goals()
+    n = PER_GOAL * len(tested) if episodes is None else episodes
+    goals = tested[spread(n, len(tested))]
+    noise = None if deterministic else torch.Generator().manual_seed(seed)
+    done = Attempted(np.zeros(n, bool), np.zeros(n, bool), np.zeros(n))
+    for begin in range(0, n, SIDE_BY_SIDE):
+        for active, step in attempts(env, policy, goals[begin : begin + SIDE_BY_SIDE], noise):
+            now = begin + active
+            done.seconds[now] += env.dt * env.action_repeat
+            done.success[now] = step.rewards > 0
+            done.fell[now] = step.terminated & (step.rewards == 0)
+    return {"run": str(folder), "iteration": iteration, "world": env.name} | told(
+        done, deterministic, seed
+    )
+
+
+def elsewhere(
+    folder: Path, name: str, episodes: int | None, deterministic: bool, seed: int
+) -> dict[str, Any]:
+    """Let it act in an environment of Gymnasium's, one episode after the other.
+
+    Args:
+        folder: the run folder.
+        name: the id of an environment with goals whose body is the run's: what it tells must be the
+            state, or the state without its place, which then is the achieved goal.
+        episodes: how many; 100 if None.
+        deterministic: without the noise of exploration.
+        seed: of that noise and of the first episode.
+
+    Raises:
+        RunError: as `at_home`.
+        UsageError: for an environment that there is not, or in which it cannot act.
+    """
+    import gymnasium
+
+    import goalgan_bt.gym  # noqa: F401  (its ids)
+
+    policy = TrainedPolicy(folder, seed)
+    try:
+        env: Any = gymnasium.make(name)
+    except Exception as error:  # each package has its own
+        raise UsageError(f"--on {name}: {error}") from None
+    n = ON if episodes is None else episodes
+    done = Attempted(np.zeros(n, bool), np.zeros(n, bool), np.zeros(n))
+    returns = np.zeros(n)
+    duration = step_seconds(env, policy.env)
+    try:
+        for i in range(n):
+            obs, _ = env.reset(seed=seed + i)
+            ended, action, actions = False, np.zeros(0), 0
+            while not ended:
+                if actions % policy.env.action_repeat == 0:  # held as long as in training
+                    state = state_of(obs, policy.env, name)
+                    action = policy.act(state, obs["desired_goal"], deterministic)
+                obs, reward, terminated, truncated, info = env.step(
+                    action.astype(env.action_space.dtype)
+                )
+                actions += 1
+                returns[i] += reward
+                success = bool(info.get("success", info.get("is_success", False)))
+                done.success[i] |= success
+                ended = terminated or truncated or success
+                done.fell[i] = terminated and not success
+            done.seconds[i] = actions * duration
+    finally:
+        env.close()
+    found = {"run": str(folder), "iteration": policy.iteration, "world": name}
+    return found | told(done, deterministic, seed) | {"return": float(returns.mean())}
+
+
+def step_seconds(env: Any, body: GoalEnv) -> float:
+    """How long a step of an environment is: as it says, or as the body's own."""
+    return float(getattr(env.unwrapped, "dt", body.dt))
+
+
+def state_of(obs: Any, body: GoalEnv, name: str) -> NDArray[np.float64]:
+    """The state of the body, (state_dim,), from what an environment tells.
+
+    Raises:
+        UsageError: where it does not tell it.
+    """
+    wanted = {"observation", "achieved_goal", "desired_goal"}
+    if isinstance(obs, dict) and wanted <= set(obs):
+        seen = np.asarray(obs["observation"], dtype=float)
+        if seen.shape == (body.state_dim,):
+            return seen
+        if seen.shape == (body.state_dim - body.goal_dim,):
+            return np.concatenate([np.asarray(obs["achieved_goal"], dtype=float), seen])
+    raise UsageError(
+        f"--on {name}: it must tell goals and the {body.state_dim} numbers of the body's state"
+    )
+
+
+def spread(n: int, goals: int) -> NDArray[np.int64]:
+    """n of so many goals, each as often as any other, or where n is less, evenly spaced; (n,)."""
+    return np.asarray(np.arange(n) * goals // n)
+
+
+def told(done: Attempted, deterministic: bool, seed: int) -> dict[str, Any]:
+    """What came of episodes, as numbers that JSON knows."""
+    n, reached = len(done.success), int(done.success.sum())
+    interval = stats.binomtest(reached, n).proportion_ci(method="wilson")
+    times = done.seconds[done.success]
+    return {
+        "policy": "deterministic" if deterministic else "stochastic",
+        "seed": seed,
+        "episodes": n,
+        "success": reached / n,
+        "interval_95": [float(interval.low), float(interval.high)],
+        "fell": float(done.fell.mean()),
+        "out_of_time": float((~done.success & ~done.fell).mean()),
+        "seconds_to_goal": {
+            "median": float(np.median(times)) if reached else None,
+            "nine_of_ten": float(np.quantile(times, 0.9)) if reached else None,
+        },
+    }
