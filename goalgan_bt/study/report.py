@@ -22,7 +22,16 @@ THRESHOLDS = (0.3, 0.48, 0.63, 0.9)  # coverage; 0.48 and 0.63 are Goyal et al. 
 
 # Whom times are compared with: all methods with the first of these, those with traces with the
 # others; where a study has none of them, all with its own first method.
-REFERENCES = ("goal_gan", "actor_critic", "per", "self_imitation", "hindsight", "trpo", "sac")
+REFERENCES = (
+    "goal_gan",
+    "actor_critic",
+    "per",
+    "straight_line",
+    "self_imitation",
+    "hindsight",
+    "trpo",
+    "sac",
+)
 
 
 TIMES = """\
