@@ -15,8 +15,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from goalgan_bt.runs.command_line import check_ranges, parse, run_command
-from goalgan_bt.runs.errors import UsageError
+from goalgan_bt.runs.command_line import check_ranges, check_target, parse, run_command
 from goalgan_bt.runs.ranges import NOT_NEGATIVE, between
 from goalgan_bt.runs.terminal import say
 
@@ -55,8 +54,8 @@ def work(argv: list[str] | None) -> None:
     """
     cfg = parse(EvaluateConfig, argv, "python -m goalgan_bt.evaluate")
     check_ranges(cfg)
-    if cfg.json is not None and not cfg.json.parent.is_dir():
-        raise UsageError(f"cannot write '{cfg.json}': there is no folder '{cfg.json.parent}'")
+    if cfg.json is not None:
+        check_target(cfg.json, (".json",))
     from goalgan_bt.learners import evaluation  # torch takes seconds
 
     if cfg.on is None:

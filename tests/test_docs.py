@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import call
+from conftest import call, run_module
 
 from goalgan_bt.learners import table
 from goalgan_bt.learners.maze_config import MazeConfig
@@ -96,6 +96,16 @@ def test_every_documented_plot_is_drawn(words, folder, tmp_path):
 def test_every_documented_evaluation_is_made(words, folder):
     done = call("evaluate", *filled(words, folder), "--episodes", "8")
     assert done.returncode == 0 and "in 8 episodes" in done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("words", [w for w in of("record") if w])
+def test_every_documented_film_is_made(words, folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    pytest.importorskip("av")
+    done = run_module("record", *filled(words, folder), "--size", "64")
+    if "pictures need OpenGL" in done.stderr:
+        pytest.skip("no EGL here")
+    assert done.returncode == 0 and "MB)" in done.stdout, done.stderr
 
 
 @pytest.mark.parametrize("words", [w for w in of("viz") if w])

@@ -80,7 +80,7 @@ def test_in_gymnasium_it_does_what_it_does_at_home(folder):
         (["--on", "Nothing-v9"], "--on Nothing-v9: "),
         (["--on", "CartPole-v1"], "it must tell goals and the 4 numbers of the body's state"),
         (["--on", "goalgan_bt/AntUMaze-v0"], "the 4 numbers of the body's state"),
-        (["--json", "/nowhere/x.json"], "there is no folder '/nowhere'"),
+        (["--json", "/nowhere/x.json"], "cannot write '/nowhere/x.json'"),
     ],
 )
 def test_bad_words_end_in_one_line(folder, words, problem):

@@ -5,7 +5,6 @@ from goalgan_bt.runs.signals import leave_at_once
 if __name__ == "__main__":
     leave_at_once()
 
-import importlib.util
 import ipaddress
 import os
 import socket
@@ -18,11 +17,12 @@ from typing import Annotated
 import tyro
 
 from goalgan_bt.learners.table import learner_of
-from goalgan_bt.runs.command_line import check_ranges, parse, run_command
+from goalgan_bt.runs.command_line import check_ranges, check_target, parse, run_command
 from goalgan_bt.runs.errors import UsageError
 from goalgan_bt.runs.ranges import Range
 from goalgan_bt.runs.run_folder import env_of
 from goalgan_bt.runs.terminal import say
+from goalgan_bt.viz import video
 from goalgan_bt.viz.page_process import free_port
 
 
@@ -108,13 +108,10 @@ def write(cfg: ViewConfig) -> None:
         OSError: if a file cannot be written.
     """
     if cfg.export is not None:
-        _check_target(cfg.export, (".html", ".htm"))
+        check_target(cfg.export, (".html", ".htm"))
     if cfg.movie is not None:
-        _check_target(cfg.movie, (".gif", ".mp4"))
-        needs = ("matplotlib", "imageio") + (("av",) if cfg.movie.suffix.lower() == ".mp4" else ())
-        if missing := [name for name in needs if importlib.util.find_spec(name) is None]:
-            extra = "movie" if "av" in missing else "plots"
-            raise UsageError(f'{missing[0]} is missing: pip install "goalgan_bt[{extra}]"')
+        check_target(cfg.movie, video.KINDS)
+        video.check_libraries(cfg.movie)
     if cfg.export is not None:
         from goalgan_bt.viz.export import export
         from goalgan_bt.viz.run import Run
@@ -144,13 +141,6 @@ def from_command_line(argv: list[str] | None = None) -> ViewConfig:
         raise UsageError("--host must name an address: 127.0.0.1 is this machine alone")
     check_ranges(cfg)
     return cfg
-
-
-def _check_target(path: Path, kinds: tuple[str, ...]) -> None:
-    if path.suffix.lower() not in kinds:
-        raise UsageError(f"cannot write '{path}': its name must end in {' or '.join(kinds)}")
-    if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
-        raise UsageError(f"cannot write '{path}': choose a file in a folder that can be written")
 
 
 def _is_loopback(host: str) -> bool:

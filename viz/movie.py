@@ -1,9 +1,7 @@
 """The map of a run as it grows, as a GIF or MP4: `python -m goalgan_bt.viz RUN --movie out.gif`."""
 
 from pathlib import Path
-from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -11,10 +9,9 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 from rich.progress import track
 
-from goalgan_bt.runs import run_folder
 from goalgan_bt.runs.errors import RunError
 from goalgan_bt.runs.frames import frame_paths
-from goalgan_bt.viz import pictures
+from goalgan_bt.viz import pictures, video
 
 PICTURES = 100  # of the run, evenly spread over its reports
 PER_SECOND = 10
@@ -38,11 +35,7 @@ def movie(folder: Path, path: Path) -> None:
     picks = np.unique(np.linspace(0, len(frames) - 1, PICTURES).round().astype(int))
     images = [_picture(folder, frames[i]) for i in track(picks, "movie", transient=True)]
     images += [images[-1]] * HOLD
-    how: dict[str, Any] = {"duration": 1000 / PER_SECOND, "loop": 0}
-    if path.suffix.lower() == ".mp4":
-        how = {"plugin": "pyav", "codec": "libx264", "fps": PER_SECOND}
-    data = iio.imwrite("<bytes>", images, extension=path.suffix.lower(), **how)
-    run_folder.write_atomically(path, lambda file: file.write(data))
+    video.save(images, path, PER_SECOND)
 
 
 def _picture(folder: Path, frame: Path) -> NDArray[np.uint8]:

@@ -3,11 +3,13 @@
 import contextlib
 import errno
 import io
+import os
 import re
 import signal
 import sys
 from collections.abc import Callable
 from itertools import pairwise
+from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
 
@@ -57,6 +59,22 @@ def check_ranges(settings: Any) -> None:
     """
     for name, problem in faults(settings):
         raise UsageError(f"--{name.replace('_', '-')} {problem}")
+
+
+def check_target(path: Path, kinds: tuple[str, ...]) -> None:
+    """See that a file can be written, before the work that goes into it.
+
+    Args:
+        path: the file.
+        kinds: how its name may end, such as `.gif`.
+
+    Raises:
+        UsageError: saying what to choose instead.
+    """
+    if path.suffix.lower() not in kinds:
+        raise UsageError(f"cannot write '{path}': its name must end in {' or '.join(kinds)}")
+    if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+        raise UsageError(f"cannot write '{path}': choose a file in a folder that can be written")
 
 
 def run_command(work: Callable[[], int | None], go_on: Callable[[], str] | None = None) -> int:
