@@ -17,6 +17,10 @@ mastered nor hopeless, and is told only how trying went:
     curriculum.save(path)
     curriculum = goalgan_bt.GoalCurriculum.load(path)
 
+The same around an environment of Gymnasium's whose observations have goals:
+
+    env = goalgan_bt.CurriculumGoals(env, curriculum)
+
 The backtracking model alone: what state and action may have led to a state, unrolled backward.
 
     model = goalgan_bt.BacktrackingModel(state_dim, act_dim, seed=0)
@@ -30,7 +34,8 @@ The same over places: which way leads from where the agent is to a goal, over wh
     places.refresh()
     left, directions = places.ways(here, goals)    # a potential to shape rewards, and a heading
 
-Recall traces for agents of Stable-Baselines3 are in `goalgan_bt.sb3`. What a call can be given that
+Callbacks for agents of Stable-Baselines3 are in `goalgan_bt.sb3`; `import goalgan_bt.gym` makes
+Gymnasium know the environments. What a call can be given that
 makes no sense is a `goalgan_bt.UsageError`, a folder that is no run a `goalgan_bt.RunError`; both
 are `ValueError`s, as is a damaged file, and their message says what to do.
 """
@@ -40,6 +45,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from goalgan_bt.curriculum.curriculum import GoalCurriculum
+    from goalgan_bt.curriculum.gym_wrapper import CurriculumGoals
     from goalgan_bt.curriculum.settings import GanConfig, GoalsConfig
     from goalgan_bt.learners.run_config import Trained
     from goalgan_bt.learners.trained_policy import TrainedPolicy, load_policy
@@ -53,6 +59,7 @@ if TYPE_CHECKING:
 __all__ = [
     "BacktrackingConfig",
     "BacktrackingModel",
+    "CurriculumGoals",
     "GanConfig",
     "GoalCurriculum",
     "GoalsConfig",
@@ -73,6 +80,7 @@ __all__ = [
 _HOME = {
     "BacktrackingConfig": "recall.settings",
     "BacktrackingModel": "recall.backtracking",
+    "CurriculumGoals": "curriculum.gym_wrapper",
     "GanConfig": "curriculum.settings",
     "GoalCurriculum": "curriculum.curriculum",
     "GoalsConfig": "curriculum.settings",

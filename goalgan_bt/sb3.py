@@ -1,12 +1,22 @@
-"""Recall traces for agents of Stable-Baselines3 and sb3-contrib (extra `sb3`).
+"""For agents of Stable-Baselines3 and sb3-contrib (extra `sb3`): a curriculum of goals, and recall
+traces, as callbacks.
 
     from stable_baselines3 import SAC
-    from goalgan_bt.sb3 import RecallConfig, RecallTraces
+    from goalgan_bt.sb3 import GoalGANCallback, RecallConfig, RecallTraces
 
-The callback itself is `goalgan_bt.learners.stable_baselines`.
+The callbacks themselves are in `goalgan_bt.learners`: `curriculum_callback`, `stable_baselines`.
 """
 
+from goalgan_bt.curriculum.gym_wrapper import CurriculumGoals, goal_as_attribute, goal_as_option
+from goalgan_bt.learners.curriculum_callback import GoalGANCallback
 from goalgan_bt.learners.stable_baselines import RecallTraces
 from goalgan_bt.recall.settings import RecallConfig
 
-__all__ = ["RecallConfig", "RecallTraces"]
+__all__ = [
+    "CurriculumGoals",
+    "GoalGANCallback",
+    "RecallConfig",
+    "RecallTraces",
+    "goal_as_attribute",
+    "goal_as_option",
+]
