@@ -95,7 +95,7 @@ class AntMaze(MazeEnv):
         along_x, _, along_z = axes_on_map(states[:, 3:7])
         front = along_x / (_length(along_x) + 1e-9)
         straight, offset = self.squashed(goals - achieved), self.squashed(along)
-        shape = (len(states), self.obs_dim)
+        shape = (states.shape[0], self.obs_dim)  # and no len(): that cannot be traced
         obs = xp.empty(shape, dtype=xp.float32, device=states.device)
         if self.heading is None:
             obs[:, :29], obs[:, 29:31], obs[:, 31:33] = states, straight, front
@@ -220,7 +220,7 @@ def _renumber_actions(actions: Array, turns: Array) -> Array:
 
 def _rows(array: Array) -> Array:
     """Indices that pick from every row, (n, 1)."""
-    return namespace(array).arange(len(array), device=array.device)[:, None]
+    return namespace(array).arange(array.shape[0], device=array.device)[:, None]
 
 
 def _length(vector: Array) -> Array:
@@ -239,7 +239,7 @@ def axes_on_map(quaternion: Array) -> Array:
     """Where unit quaternions (w, x, y, z), (n, 4), turn the x, y and z axes: the first two
     components of each, (3, n, 2)."""
     w, x, y, z = columns(quaternion)
-    axes = namespace(quaternion).empty((3, len(quaternion), 2), device=w.device)
+    axes = namespace(quaternion).empty((3, quaternion.shape[0], 2), device=w.device)
     axes[0, :, 0] = 1 - 2 * (y * y + z * z)
     axes[0, :, 1] = 2 * (x * y + w * z)
     axes[1, :, 0] = 2 * (x * y - w * z)

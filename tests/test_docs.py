@@ -98,6 +98,14 @@ def test_every_documented_evaluation_is_made(words, folder):
     assert done.returncode == 0 and "in 8 episodes" in done.stdout, done.stderr
 
 
+@pytest.mark.parametrize("words", [w for w in of("export") if w])
+def test_every_documented_policy_is_exported(words, folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    pytest.importorskip("onnxscript")
+    done = call("export", *filled(words, folder))
+    assert done.returncode == 0 and "MB)" in done.stdout, done.stderr
+
+
 @pytest.mark.parametrize("words", [w for w in of("record") if w])
 def test_every_documented_film_is_made(words, folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

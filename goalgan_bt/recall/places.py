@@ -44,6 +44,24 @@ class Ways(NamedTuple):
     directions: FloatArray
 
 
+class Tabulated(NamedTuple):
+    """All ways between places, for who computes with tensors (`Places.tabulated`).
+
+    low, high, strides: (goal_dim,) the lattice: a point's key is its coordinates times the strides.
+    numbers, ends: (P,) by key, the number of the place there, K where nobody has been, and of the
+    nearest place visited. places: (K, goal_dim). table: (K, K + 1, 2 + goal_dim) to each place from
+    each: whether a way is known, what is left of it, its direction; zeros from place K.
+    """
+
+    low: FloatArray
+    high: FloatArray
+    strides: Nodes
+    numbers: Nodes
+    ends: Nodes
+    places: FloatArray
+    table: NDArray[np.float32]
+
+
 class Places:
     """Where the agent has been, the moves that it made, and the ways that they add up to.
 
@@ -53,6 +71,7 @@ class Places:
         cfg: settings; those of the mazes if None.
 
     Attributes:
+        near: metres, within which a goal is where one sees it.
         places: (K, goal_dim) the places visited; moves: (K, K) how often each move was made.
 
     Raises:
@@ -68,7 +87,7 @@ class Places:
     ) -> None:
         self.cfg = cfg = cfg or PlacesConfig()
         self._low, self._high = require_box(low, high)
-        self._near = NEAR * success_radius
+        self.near = NEAR * success_radius
         # A point of the lattice has a number, its key; a step along axis i adds strides[i] to it.
         self._sides = lattice(self._low, self._high, cfg)
         self._strides = np.concatenate([[1], np.cumprod(self._sides[:-1])])
@@ -159,7 +178,7 @@ class Places:
         # The goal is where one sees it: near and in sight, from the end of what is known on, and
         # where no way leads or nobody has been (optimism, which finds short cuts).
         cell = self.cfg.cell
-        as_seen = (straight < self._near) & (left < AROUND * straight + 2 * cell)
+        as_seen = (straight < self.near) & (left < AROUND * straight + 2 * cell)
         as_seen |= (recalled < 2 * cell) | (straight < cell) | (mean[:, 0] < 1e-6)
         turned = as_seen | ~(np.square(along).sum(axis=1) > 1e-12)
         return Ways(
@@ -176,6 +195,30 @@ class Places:
             self._last = (np.copy(places), np.copy(goals)), offsets
         # The Ant asks twice: for what it sees, and for which of its legs is which.
         return self._last[1].copy()
+
+    def tabulated(self) -> Tabulated:
+        """All ways, as they are since the last refresh.
+
+        Raises:
+            UsageError: if those are too many to be written down.
+        """
+        k, points = len(self), int(np.prod(self._sides))
+        if k * k > MOST or points > MOST:
+            raise UsageError(f"the ways between {k} places of {points} are too many for a table")
+        keys = np.arange(points)
+        numbers = self._find(keys)
+        rows, ends = self._rows_of(self._points(keys))
+        order = np.zeros(k, np.int64)
+        order[ends] = rows
+        return Tabulated(
+            self._low,
+            self._high,
+            self._strides,
+            np.where(numbers < 0, k, numbers),
+            ends,
+            self.places,
+            self._table[order],
+        )
 
     def state_dict(self) -> dict[str, Tensor]:
         """The places and the moves; ways follow from them."""
