@@ -19,8 +19,9 @@ def learn(folder, *flags):
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("seed", ["0", "1"])
 def test_the_point_learns_most_of_the_umaze(tmp_path, seed):
+    """Seeds 0 to 9 reach 0.96 within 0.7 million steps and end at 0.99 or above."""
     coverage = learn(tmp_path / "run", "--env", "point_umaze", "--seed", seed)
-    assert coverage[-1] >= 0.9
+    assert max(coverage[:4]) >= 0.9 and coverage[-1] >= 0.95
 
 
 @pytest.mark.slow
@@ -40,6 +41,15 @@ def test_the_default_beats_uniform_goals_on_the_same_budget(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_the_ant_learns_to_walk_around_both_corners(tmp_path):
+def test_the_point_learns_a_box_of_six_dimensions(tmp_path):
+    """Five seeds end at 0.85 or above."""
+    coverage = learn(tmp_path / "run", "--env", "point_nd", "--dim", "6")
+    assert coverage[-1] >= 0.75
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_the_ant_learns_most_of_the_umaze(tmp_path):
+    """In runs of 12 million steps five seeds are at 0.76 or above after 3.3 million."""
     coverage = learn(tmp_path / "run", "--env", "ant_umaze", "--total-steps", "4000000")
-    assert coverage[-1] >= 0.6 > 0.25 > coverage[0]
+    assert coverage[-1] >= 0.7 > 0.25 > coverage[0]
