@@ -49,6 +49,8 @@ def test_the_wheel_is_complete_and_installs_one_package(built):
     assert len(ours) > 100
     assert ours <= set(names) and "goalgan_bt/py.typed" in names
     assert "goalgan_bt/viz/export.html" in names
+    demo = {str(p.relative_to(ROOT)) for p in (ROOT / "goalgan_bt/demo").rglob("*.npz")}
+    assert demo and demo <= set(names)
 
 
 def test_the_sdist_holds_what_the_wheel_needs(built):

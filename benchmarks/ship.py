@@ -1,0 +1,48 @@
+"""The part of a run folder that a demo needs: policy, places, some reports.
+
+    python -m goalgan_bt.train --env ant_umaze --coverage.every 1000000
+    python benchmarks/ship.py RUN goalgan_bt/demo/ant_umaze
+
+A whole checkpoint holds all that learns and remembers, some tens of megabytes.
+"""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from goalgan_bt.runs import checkpoint
+from goalgan_bt.runs.frames import frame_paths
+
+REPORTS = 24  # evenly spread over the run
+PRIVATE = "--out"  # the flag that names a path of the machine
+
+
+def ship(run: Path, out: Path) -> None:
+    out.mkdir(parents=True)
+    (out / "frames").mkdir()
+    for name in ("metrics.csv", "ended.txt"):
+        shutil.copy(run / name, out / name)
+    settings = json.loads((run / "config.json").read_text())
+    (out / "config.json").write_text(json.dumps(settings | {"out": "runs"}, indent=2) + "\n")
+    meta = json.loads((run / "meta.json").read_text())
+    words = meta["argv"]
+    if PRIVATE in words:
+        at = words.index(PRIVATE)
+        meta["argv"] = words[:at] + words[at + 2 :]
+    (out / "meta.json").write_text(json.dumps(meta, indent=2) + "\n")
+    frames = frame_paths(run)
+    for i in np.unique(np.linspace(0, len(frames) - 1, REPORTS).round().astype(int)):
+        shutil.copy(frames[i], out / "frames" / frames[i].name)
+    with checkpoint.saved(run) as state:
+        learner = {name: state["learner"][name] for name in ("policy", "places")}
+        kept = {"learner": learner, "run": {"iteration": state["run"]["iteration"]}}
+    checkpoint.save(kept, out / "checkpoint.pt")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
+    ship(Path(sys.argv[1]), Path(sys.argv[2]))
