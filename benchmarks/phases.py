@@ -55,8 +55,16 @@ PHASES = {
     "labels": (
         "goalgan_bt.learners.maze_learner:MazeLearner.remember",
         "goalgan_bt.curriculum.curriculum:GoalCurriculum.judge",
+        "goalgan_bt.curriculum.curriculum:GoalCurriculum.propose",
+        "goalgan_bt.curriculum.curriculum:GoalCurriculum.recollect",
         "goalgan_bt.curriculum.goals:SuccessEstimator.__call__",
         "goalgan_bt.curriculum.goals:GoalMemory.add",
+    ),
+    "places": (
+        "goalgan_bt.recall.places:Places.learn",
+        "goalgan_bt.recall.places:Places.refresh",
+        "goalgan_bt.recall.places:Places.ways",
+        "goalgan_bt.recall.places:Places.heading",
     ),
     "decoder and recall traces": (
         "goalgan_bt.learners.maze:decode",
@@ -75,7 +83,7 @@ PHASES = {
     "checkpoint": ("goalgan_bt.runs.checkpoint:save",),
     "waiting for the second thread": ("concurrent.futures:Future.result",),
 }
-WHOLE = set(PHASES) - {"bookkeeping of rollouts"}
+WHOLE = set(PHASES) - {"bookkeeping of rollouts", "observation"}
 REST = "the rest of training"
 
 

@@ -10,14 +10,14 @@ from goalgan_bt.agent.rollout import Collector
 from goalgan_bt.agent.settings import PolicyConfig, RolloutConfig
 
 
-def make(name="point_umaze", n=16, steps=40, chain=0.0, horizon=25, seed=0, failures=False):
+def make(name="point_umaze", n=16, steps=40, chain=0.0, horizon=25, seed=0, keep="successes"):
     torch.manual_seed(seed)
     env = envs.make(name, n, threads=1, horizon=horizon)
     policy = GaussianPolicy(env.obs_dim, env.act_dim, PolicyConfig(hidden=(8,), init_std=1.0))
     cfg = RolloutConfig(num_envs=n, steps=steps, chain=chain)
     noise = torch.Generator().manual_seed(seed)
     rng = np.random.default_rng(seed)
-    return env, policy, Collector(env, cfg, rng, noise, failures)
+    return env, policy, Collector(env, cfg, rng, noise, keep)
 
 
 NEAR = np.array([[0.35, 0.0], [0.0, 0.4], [-0.4, 0.0]])
@@ -111,7 +111,7 @@ def test_episodes_are_complete_and_their_transitions_real():
 
 
 def test_failures_are_kept_where_they_are_wanted_but_falls_never():
-    env, policy, collector = make("ant_umaze", n=32, steps=150, horizon=100, failures=True)
+    env, policy, collector = make("ant_umaze", n=32, steps=150, horizon=100, keep="all")
     collector.begin(np.array([[4.0, 4.0]]))
     rollouts, episodes = collector.collect(policy, np.array([[4.0, 4.0]]))
     fell = rollouts.terminated & (rollouts.rewards == 0)

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -98,8 +98,8 @@ class Collector:
         cfg: settings.
         rng: draws goals and chains.
         noise: draws actions.
-        failures: whether to keep the transitions of episodes that ran out of time, besides those
-            that succeeded.
+        keep: the transitions of which episodes: of none, of those that succeeded, or also of those
+            that ran out of time.
     """
 
     def __init__(
@@ -108,9 +108,9 @@ class Collector:
         cfg: RolloutConfig,
         rng: np.random.Generator,
         noise: torch.Generator,
-        failures: bool = False,
+        keep: Literal["none", "successes", "all"] = "successes",
     ) -> None:
-        self._failures = failures
+        self._keep = keep
         self.env, self.cfg, self._rng, self._noise = env, cfg, rng, noise
         n = env.num_envs
         self._all = np.arange(n)
@@ -120,7 +120,7 @@ class Collector:
         self._start_achieved = env.achieved_goals(env.start_state[None])
         # Every unfinished episode, action by action: successes are known only when they end.
         self._age = np.zeros(n, dtype=np.int64)  # actions since the episode began
-        longest = math.ceil(env.horizon / env.action_repeat)
+        longest = math.ceil(env.horizon / env.action_repeat) if keep != "none" else 0
         self._states = np.zeros((longest + 1, n, env.state_dim), dtype=np.float32)
         self._actions = np.zeros((longest, n, env.act_dim), dtype=np.float32)
         self._obs = self._table(np.float32, env.obs_dim)
@@ -168,9 +168,10 @@ class Collector:
             self._obs[t], self._sampled[t] = obs, actions
             self._goals[t], self._origins[t] = env.goals, achieved
             step = env.step(ids, actions)
-            self._actions[self._age, ids] = step.actions
+            if self._keep != "none":
+                self._actions[self._age, ids] = step.actions
+                self._states[self._age + 1, ids] = step.states
             self._age += 1
-            self._states[self._age, ids] = step.states
             self._rewards[t], self._achieved[t] = step.rewards, step.achieved
             self._terminated[t], self._truncated[t] = step.terminated, step.truncated
 
@@ -179,7 +180,8 @@ class Collector:
             if len(done):
                 reached = step.rewards[done] > 0
                 fell = step.terminated[done] & ~reached
-                lengths, kept = self._age[done], ~fell if self._failures else reached
+                kept = {"none": reached & ~reached, "successes": reached, "all": ~fell}[self._keep]
+                lengths = self._age[done]
                 goals_then, ends = env.goals[done], step.achieved[done]
                 first = self._from_start[done]
                 ended.append((done, goals_then, reached, first, lengths, ends, kept))
@@ -223,7 +225,8 @@ class Collector:
     def _chain(self, ids: Ids, goals: FloatArray) -> None:
         if len(ids) == 0:
             return
-        self._states[0, ids] = self._states[self._age[ids], ids]
+        if self._keep != "none":
+            self._states[0, ids] = self._states[self._age[ids], ids]
         self._age[ids] = 0
         self.env.set_goals(ids, goals)
         self._from_start[ids] = False

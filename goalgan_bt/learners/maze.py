@@ -176,8 +176,8 @@ def begin(learner: MazeLearner, env: GoalEnv, test_env: GoalEnv, run: Session) -
     wherever a fresh policy happens to wander.
     """
     cfg, curriculum = learner.cfg, learner.curriculum
-    failures = cfg.backtracking.experience == "all"
-    collector = Collector(env, cfg.rollout, learner.rng, learner.noise["rollout"], failures)
+    keep = cfg.backtracking.experience if cfg.imitation.source != "none" else "none"
+    collector = Collector(env, cfg.rollout, learner.rng, learner.noise["rollout"], keep)
     if run.iteration > 0:
         goals, steps = learner.propose(test_env)
         run.count("label", steps)
@@ -286,10 +286,14 @@ def shaping(learner: MazeLearner, rollouts: Rollouts) -> Float32:
         return np.zeros_like(rollouts.rewards)
     goals = rollouts.goals.reshape(-1, dim)
 
-    def left(places: Float32) -> FloatArray:
-        return learner.places.ways(places.reshape(-1, dim), goals).left.reshape(steps, n)
-
-    shorter = left(rollouts.origins) - left(rollouts.achieved)
+    after = learner.places.ways(rollouts.achieved.reshape(-1, dim), goals).left.reshape(steps, n)
+    # An action begins where the last one ended, but for those that begin an episode.
+    before, begun = np.empty_like(after), np.ones((steps, n), dtype=bool)
+    before[1:] = after[:-1]
+    begun[1:] = (rollouts.terminated | rollouts.truncated)[:-1]
+    anew = rollouts.origins[begun], rollouts.goals[begun]
+    before[begun] = learner.places.ways(*anew).left
+    shorter = before - after
     failed = rollouts.terminated & (rollouts.rewards == 0)
     return np.where(failed, 0.0, cfg.shaping * shorter).astype(np.float32)
 

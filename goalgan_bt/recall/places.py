@@ -156,7 +156,6 @@ class Places:
         self._table = np.zeros((0, k + 1, 2 + dim), np.float32)
         self._row = np.full(k, -1)  # by the place nearest to the goal
         self._asked, self._ends = np.empty(0, np.int64), np.empty(0, np.int64)  # by a goal's key
-        self._last: tuple[tuple[FloatArray, FloatArray], FloatArray] | None = None
         if goals is not None and len(a):
             self._rows_of(goals)
 
@@ -188,13 +187,8 @@ class Places:
     def heading(self, places: FloatArray, goals: FloatArray) -> FloatArray:
         """Offsets from places to goals, (n, goal_dim) each, along the way: as far as the way is
         long, in the direction in which it begins."""
-        asked = places, goals
-        if self._last is None or not all(map(np.array_equal, asked, self._last[0])):
-            ways = self.ways(places, goals)
-            offsets = ways.directions * ways.left[:, None]
-            self._last = (np.copy(places), np.copy(goals)), offsets
-        # The Ant asks twice: for what it sees, and for which of its legs is which.
-        return self._last[1].copy()
+        ways = self.ways(places, goals)
+        return np.asarray(ways.directions * ways.left[:, None])
 
     def tabulated(self) -> Tabulated:
         """All ways, as they are since the last refresh.
