@@ -23,7 +23,7 @@ SHORT = (  # long enough for goals of intermediate difficulty, so that there are
     "--gan.pretrain-steps 20 --gan.steps 20 --backtracking.min-transitions 100 "
     "--imitation.fade None"
 )
-MORE = {"alp_gmm": ("--iterations", "5")}  # its mixture needs a few hundred episodes
+MORE = {"alp_gmm": ("--iterations", "7")}  # its mixture needs a few hundred episodes
 UMAZE = mazes.layout("umaze")
 METHOD = pytest.mark.parametrize("method", METHODS)
 
@@ -71,7 +71,7 @@ def of(method, setting, default):
 def test_each_method_trains_and_reports(method, trained_by):
     run = trained_by(method)
     assert [int(row["iteration"]) for row in run.rows] == [*range(1, len(run.frames) + 1)]
-    assert len(run.rows) == (5 if method in MORE else 3)
+    assert len(run.rows) == (7 if method in MORE else 3)
     measured = run.frames[-1]["coverage"]
     assert float(run.rows[-1]["eval/coverage"]) == pytest.approx(measured.mean(), abs=1e-5)
     assert (run.total("steps/label") > 0) == (method == "oracle")
@@ -148,6 +148,9 @@ def fresh_learner(method):
 def test_experience_is_that_of_successes_where_the_method_says_so(method, trained_by):
     """Where time ran out, an episode's goal counts as where it ended, and no gap is left."""
     known = trained_by(method).learner["transitions"]
+    if of(method, "imitation.source", "none") == "none":  # nobody would look at them
+        assert len(known["left"]) == 0
+        return
     ends = known["left"] == 0
     gaps = (known["next_states"][ends, :2] - known["goals"][ends]).norm(dim=1)
     assert len(gaps) > 20 and gaps.max() < 0.3 + 1e-5

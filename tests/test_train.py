@@ -9,11 +9,13 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import conftest
 import numpy as np
 import pytest
 import torch
 from conftest import call, run_module, started
 
+from goalgan_bt.envs import maze as mazes
 from goalgan_bt.learners import maze_learner, table
 from goalgan_bt.learners.maze import train
 from goalgan_bt.learners.maze_config import make_env
@@ -186,8 +188,12 @@ def test_a_failed_resume_leaves_the_run_as_it_was(tmp_path):
     assert run("--resume", folder, "--iterations", 3, out=out).returncode == 0
 
 
-def test_a_resumed_learner_takes_new_learning_rates_and_buffers(trained):
-    cfg = table.load(trained)
+def test_a_resumed_learner_takes_new_learning_rates_and_buffers(tmp_path):
+    trained = tmp_path / "run"
+    trained.mkdir()
+    run_folder.write_meta(trained, mazes.layout("umaze"))
+    cfg = table.from_command_line([*conftest.TINY.split(), "--imitation.source", "traces"])
+    train(cfg, trained)
     value, model = cfg.value, cfg.backtracking
     value, model = replace(value, learning_rate=0.5), replace(model, buffer=2 * model.buffer)
     cfg = replace(cfg, value=value, backtracking=model)
