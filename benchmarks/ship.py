@@ -17,7 +17,14 @@ from goalgan_bt.runs import checkpoint
 from goalgan_bt.runs.frames import frame_paths
 
 REPORTS = 24  # evenly spread over the run
-PRIVATE = "--out"  # the flag that names a path of the machine
+PRIVATE = "--out", "--map"  # flags that name a path of the machine
+
+
+def without_paths(words: list[str]) -> list[str]:
+    """A command line without the flags that name paths, as `--out X` or `--out=X`."""
+    kept = [word for word in words if not word.startswith(tuple(f"{flag}=" for flag in PRIVATE))]
+    named = {i for i, word in enumerate(kept) if word in PRIVATE}
+    return [word for i, word in enumerate(kept) if not {i, i - 1} & named]
 
 
 def ship(run: Path, out: Path) -> None:
@@ -26,12 +33,12 @@ def ship(run: Path, out: Path) -> None:
     for name in ("metrics.csv", "ended.txt"):
         shutil.copy(run / name, out / name)
     settings = json.loads((run / "config.json").read_text())
-    (out / "config.json").write_text(json.dumps(settings | {"out": "runs"}, indent=2) + "\n")
+    public = settings | {"out": "runs", "map": None}
+    (out / "config.json").write_text(json.dumps(public, indent=2) + "\n")
     meta = json.loads((run / "meta.json").read_text())
-    words = meta["argv"]
-    if PRIVATE in words:
-        at = words.index(PRIVATE)
-        meta["argv"] = words[:at] + words[at + 2 :]
+    if "resumed" in meta:
+        sys.exit("a run that was resumed is none that one command makes: ship another")
+    meta["argv"] = without_paths(meta["argv"])
     (out / "meta.json").write_text(json.dumps(meta, indent=2) + "\n")
     frames = frame_paths(run)
     for i in np.unique(np.linspace(0, len(frames) - 1, REPORTS).round().astype(int)):

@@ -57,10 +57,10 @@ class FourRoomsEnv(gymnasium.Env[Any, Any]):
 
     def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
         """Take a step; into a wall it leads nowhere."""
-        self._state, self._elapsed = (
-            int(self.rooms.next_state[self._state, action]),
-            self._elapsed + 1,
-        )
+        if not self.action_space.contains(action):
+            raise ValueError(f"an action is a number from 0 to 3, not {action!r}")
+        self._state = int(self.rooms.next_state[self._state, action])
+        self._elapsed += 1
         success = self._state == self.rooms.goal
         truncated = not success and self._elapsed >= self._horizon
         info = {"success": success, "is_success": success}

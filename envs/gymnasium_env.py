@@ -5,6 +5,7 @@ that gymnasium-robotics gave goals: an observation is a dictionary of `observati
 `achieved_goal` and `desired_goal`, and rewards can be computed anew for other goals.
 """
 
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from goalgan_bt.envs import make
 from goalgan_bt.envs.goal_env import GoalEnv, Step
 from goalgan_bt.envs.maze import BoolArray, FloatArray
+from goalgan_bt.envs.mujoco_env import INTEGRATORS
 from goalgan_bt.envs.picture import Picture
 
 FAST = 1000.0  # m/s or rad/s, m or rad: what only a diverged body exceeds
@@ -25,15 +27,85 @@ ONE = np.arange(1)
 
 
 class Rules:
-    """What holds for one simulation and for many: spaces, and what a goal means.
+    """What holds for one simulation and for many: the world, spaces, what a goal means, pictures.
+
+    Args:
+        name: of the environment, as `--env` takes it.
+        num_envs, threads: simulations and their threads.
+        render_mode: one of the metadata's, or None.
+        map_file, horizon, action_repeat, integrator, dim: see `goalgan_bt.envs.make`.
+        width, height: of pictures, pixels.
 
     Attributes:
         sims: the simulations.
+
+    Raises:
+        ValueError: for an environment or settings that there are not.
     """
 
-    def __init__(self, sims: GoalEnv) -> None:
-        self.sims = sims
-        self._bounds: Any = observation_space(sims)
+    metadata: dict[str, Any]
+
+    def __init__(
+        self,
+        name: str,
+        num_envs: int,
+        threads: int,
+        render_mode: str | None,
+        *,
+        map_file: Path | str | None = None,
+        horizon: int | None = None,
+        action_repeat: int = 1,
+        integrator: str = "implicitfast",
+        dim: int = 2,
+        width: int = FRAME,
+        height: int = FRAME,
+    ) -> None:
+        for setting, number, least in (
+            ("num_envs", num_envs, 1),
+            ("threads", threads, 0),
+            ("horizon", 1 if horizon is None else horizon, 1),
+            ("action_repeat", action_repeat, 1),
+            ("width", width, 1),
+            ("height", height, 1),
+        ):
+            if isinstance(number, bool) or not isinstance(number, Integral) or number < least:
+                raise ValueError(
+                    f"{setting} must be a whole number from {least} on, not {number!r}"
+                )
+        if integrator not in INTEGRATORS:
+            raise ValueError(f"integrator is {' or '.join(INTEGRATORS)}, not {integrator!r}")
+        modes = self.metadata["render_modes"]
+        if render_mode is not None and render_mode not in modes:
+            raise ValueError(f"render_mode is {', '.join(modes)} or None, not {render_mode!r}")
+        self.sims = make(
+            name,
+            num_envs,
+            threads=threads,
+            map_file=None if map_file is None else Path(map_file),
+            horizon=horizon,
+            action_repeat=action_repeat,
+            integrator=integrator,
+            dim=dim,
+        )
+        if render_mode is not None and not hasattr(self.sims, "model"):
+            raise ValueError(f"{name} is no MuJoCo model: it has no pictures")
+        per_second = round(1 / self.sims.dt / action_repeat)
+        self.metadata = self.metadata | {"render_fps": per_second}
+        self.render_mode, self._size = render_mode, (width, height)
+        self._picture: Picture | None = None
+        self._bounds: Any = observation_space(self.sims)
+
+    def picture(self) -> Picture:
+        """What draws, made when it is first asked for."""
+        if self._picture is None:
+            self._picture = Picture(self.sims, *self._size)
+        return self._picture
+
+    def put_away(self) -> None:
+        """Let go of the picture or window."""
+        if self._picture is not None:
+            self._picture.close()
+            self._picture = None
 
     def compute_reward(
         self, achieved_goal: FloatArray, desired_goal: FloatArray, info: Any
@@ -147,18 +219,6 @@ def _row(name: str, value: Any, size: int) -> FloatArray:
     return row
 
 
-def check_render_mode(mode: str | None, modes: list[str], env: GoalEnv) -> None:
-    """Refuse what cannot be drawn.
-
-    Raises:
-        ValueError: saying why.
-    """
-    if mode is not None and mode not in modes:
-        raise ValueError(f"render_mode is {', '.join(modes)} or None, not {mode!r}")
-    if mode is not None and not hasattr(env, "model"):
-        raise ValueError(f"{env.name} is no MuJoCo model: it has no pictures")
-
-
 class GoalGymEnv(Rules, gymnasium.Env[Any, Any]):
     """Bring one body to a goal. An episode ends when it is reached (terminated, reward 1), when
     the body fails (terminated, reward 0), or after `horizon` steps (truncated).
@@ -166,8 +226,7 @@ class GoalGymEnv(Rules, gymnasium.Env[Any, Any]):
     Args:
         name: of the environment, as `--env` takes it.
         render_mode: `rgb_array` (MuJoCo's renderer), `human` (its window), or None.
-        map_file, horizon, action_repeat, integrator, dim: see `goalgan_bt.envs.make`.
-        width, height: of pictures, pixels.
+        settings: map_file, horizon, action_repeat, integrator, dim, width, height: see `Rules`.
 
     Raises:
         ValueError: for an environment or settings that there are not.
@@ -178,34 +237,8 @@ class GoalGymEnv(Rules, gymnasium.Env[Any, Any]):
         "render_fps": 50,
     }
 
-    def __init__(
-        self,
-        name: str,
-        render_mode: str | None = None,
-        *,
-        map_file: Path | None = None,
-        horizon: int | None = None,
-        action_repeat: int = 1,
-        integrator: str = "implicitfast",
-        dim: int = 2,
-        width: int = FRAME,
-        height: int = FRAME,
-    ) -> None:
-        sims = make(
-            name,
-            1,
-            threads=1,
-            map_file=map_file,
-            horizon=horizon,
-            action_repeat=action_repeat,
-            integrator=integrator,
-            dim=dim,
-        )
-        super().__init__(sims)
-        check_render_mode(render_mode, self.metadata["render_modes"], sims)
-        self.metadata = self.metadata | {"render_fps": round(1 / self.sims.dt / action_repeat)}
-        self.render_mode, self._size = render_mode, (width, height)
-        self._picture: Picture | None = None
+    def __init__(self, name: str, render_mode: str | None = None, **settings: Any) -> None:
+        super().__init__(name, 1, 1, render_mode, **settings)
         self.observation_space, self.action_space = self._bounds, action_space(self.sims)
 
     def reset(
@@ -246,16 +279,12 @@ class GoalGymEnv(Rules, gymnasium.Env[Any, Any]):
         """
         if self.render_mode is None:
             return None
-        if self._picture is None:
-            self._picture = Picture(self.sims, *self._size)
         state, goal = self.sims.read_states(ONE)[0], self.sims.goals[0]
         if self.render_mode == "human":
-            self._picture.show(state, goal)
+            self.picture().show(state, goal, 1 / self.metadata["render_fps"])
             return None
-        return self._picture.draw(state, goal)
+        return self.picture().draw(state, goal)
 
     def close(self) -> None:
         """Let go of the picture or window."""
-        if self._picture is not None:
-            self._picture.close()
-            self._picture = None
+        self.put_away()

@@ -1,6 +1,5 @@
 """Many of them at once as a Gymnasium vector environment, on the batched simulator."""
 
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -10,19 +9,14 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from goalgan_bt.envs import make
 from goalgan_bt.envs.goal_env import Ids
 from goalgan_bt.envs.gymnasium_env import (
-    FRAME,
-    GoalGymEnv,
     Rules,
     action_space,
     begin,
-    check_render_mode,
     clipped,
 )
 from goalgan_bt.envs.maze import BoolArray, FloatArray
-from goalgan_bt.envs.picture import Picture
 
 Obs = dict[str, FloatArray]
 
@@ -39,12 +33,13 @@ class GoalVectorEnv(Rules, gymnasium.vector.VectorEnv[Obs, NDArray[np.float32], 
             another: with the next step (Gymnasium's default), with the same (`final_obs` and
             `final_info` tell how it ended), or when `reset` is asked to.
         threads: simulation threads, 0 for one per core. Results do not depend on it.
-        map_file, horizon, action_repeat, integrator, dim: see `goalgan_bt.envs.make`.
-        width, height: of pictures, pixels.
+        settings: map_file, horizon, action_repeat, integrator, dim, width, height: see `Rules`.
 
     Raises:
         ValueError: for an environment or settings that there are not.
     """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
 
     def __init__(
         self,
@@ -54,32 +49,11 @@ class GoalVectorEnv(Rules, gymnasium.vector.VectorEnv[Obs, NDArray[np.float32], 
         *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         threads: int = 0,
-        map_file: Path | None = None,
-        horizon: int | None = None,
-        action_repeat: int = 1,
-        integrator: str = "implicitfast",
-        dim: int = 2,
-        width: int = FRAME,
-        height: int = FRAME,
+        **settings: Any,
     ) -> None:
-        sims = make(
-            name,
-            num_envs,
-            threads=threads,
-            map_file=map_file,
-            horizon=horizon,
-            action_repeat=action_repeat,
-            integrator=integrator,
-            dim=dim,
-        )
-        super().__init__(sims)
-        check_render_mode(render_mode, ["rgb_array"], sims)
-        self.num_envs, self.render_mode, self._size = num_envs, render_mode, (width, height)
-        self._mode = AutoresetMode(autoreset_mode)
-        self.metadata = GoalGymEnv.metadata | {
-            "render_fps": round(1 / self.sims.dt / action_repeat),
-            "autoreset_mode": self._mode,
-        }
+        super().__init__(name, num_envs, threads, render_mode, **settings)
+        self.num_envs, self._mode = num_envs, AutoresetMode(autoreset_mode)
+        self.metadata = self.metadata | {"autoreset_mode": self._mode}
         self.single_observation_space = self._bounds
         self.single_action_space = action_space(self.sims)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -87,7 +61,7 @@ class GoalVectorEnv(Rules, gymnasium.vector.VectorEnv[Obs, NDArray[np.float32], 
         self._all = np.arange(num_envs)
         self._ended = np.zeros(num_envs, dtype=bool)
         self._rngs: list[np.random.Generator] = [seeding.np_random()[0] for _ in self._all]
-        self._picture: Picture | None = None
+        self._begun = False
 
     def reset(
         self,
@@ -127,6 +101,7 @@ class GoalVectorEnv(Rules, gymnasium.vector.VectorEnv[Obs, NDArray[np.float32], 
         for i in ids:
             self._rngs[i] = rngs[i]
         self._begin(ids, starts)
+        self._begun = True
         return self._told(), _infos({"success": False, "is_success": False, "healthy": True}, mask)
 
     def step(
@@ -135,8 +110,11 @@ class GoalVectorEnv(Rules, gymnasium.vector.VectorEnv[Obs, NDArray[np.float32], 
         """Take one action in each simulation, or begin its next episode.
 
         Raises:
+            ResetNeeded: before the first `reset`.
             ValueError: for a simulation whose episode has ended, where nothing resets by itself.
         """
+        if not self._begun:
+            raise gymnasium.error.ResetNeeded("call reset before the first step")
         if self._mode is AutoresetMode.DISABLED and self._ended.any():
             raise ValueError(
                 f"the episodes of simulations {np.flatnonzero(self._ended).tolist()} have ended: "
@@ -184,16 +162,12 @@ class GoalVectorEnv(Rules, gymnasium.vector.VectorEnv[Obs, NDArray[np.float32], 
         """
         if self.render_mode is None:
             return None
-        if self._picture is None:
-            self._picture = Picture(self.sims, *self._size)
         states = self.sims.read_states(self._all)
-        return tuple(map(self._picture.draw, states, self.sims.goals))
+        return tuple(map(self.picture().draw, states, self.sims.goals))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Let go of the picture."""
-        if self._picture is not None:
-            self._picture.close()
-            self._picture = None
+        self.put_away()
 
     def _options_of(self, options: dict[str, Any], i: Any) -> dict[str, Any]:
         """Those of one simulation."""

@@ -1,5 +1,6 @@
 """A simulation as MuJoCo draws it: the body, the walls, start and goal."""
 
+import time
 from typing import Any
 
 import mujoco
@@ -37,6 +38,7 @@ class Picture:
         self._size = height, width
         self._renderer: Any = None
         self._window: Any = None
+        self._due = 0.0  # when the window may show the next state
         self._camera = mujoco.MjvCamera()
         low, high = env.goal_low, env.goal_high
         self._camera.lookat[:2] = (low + high) / 2
@@ -60,8 +62,8 @@ class Picture:
         self._mark(self._renderer.scene, goal)
         return np.asarray(self._renderer.render())
 
-    def show(self, state: FloatArray, goal: FloatArray) -> None:
-        """The same in a window.
+    def show(self, state: FloatArray, goal: FloatArray, seconds: float) -> None:
+        """The same in a window, at least so long after the last time.
 
         Raises:
             PhysicsError: where there is no screen.
@@ -81,7 +83,9 @@ class Picture:
         if self._window.user_scn is not None:
             self._window.user_scn.ngeom = 0
             self._mark(self._window.user_scn, goal)
+        time.sleep(max(0.0, self._due - time.monotonic()))
         self._window.sync()
+        self._due = time.monotonic() + seconds
 
     def close(self) -> None:
         """Let go of what draws."""

@@ -29,7 +29,7 @@ class EvaluateConfig:
     episodes: Annotated[int | None, between(1, 1_000_000)] = None
     """Episodes in all, spread evenly over the goals; by default three each, or 100 with --on."""
     deterministic: bool = False
-    """Act without the noise of exploration."""
+    """Act without the noise of exploration, and so at most once for each goal."""
     on: str | None = None
     """Act in this environment of Gymnasium's instead, such as goalgan_bt/AntUMaze-v0: one with
     goals whose body is the run's. Success is what its info says."""

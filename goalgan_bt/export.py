@@ -54,10 +54,12 @@ def work(argv: list[str] | None) -> None:
     from goalgan_bt.learners import onnx_policy
 
     logging.disable(logging.WARNING)  # torch tells of what nobody has asked for
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-        warnings.simplefilter("ignore")
-        onnx_policy.export(cfg.run, cfg.onnx)
-    logging.disable(logging.NOTSET)
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            onnx_policy.export(cfg.run, cfg.onnx)
+    finally:
+        logging.disable(logging.NOTSET)
     say(f"{cfg.onnx} ({cfg.onnx.stat().st_size / 1e6:.1f} MB)")
 
 

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 BY_ITSELF = 3  # goals that are filmed where none is named
 HOLD = 0.5  # seconds for which the end of an episode is shown
+MOST = 4e9  # bytes of pictures in memory until they are written
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,9 @@ def work(argv: list[str] | None) -> None:
 
     policy = TrainedPolicy(cfg.run, cfg.seed)
     goals = goals_of(cfg, policy)
+    longest = len(goals) * (2 + policy.env.horizon // policy.env.action_repeat)
+    if 3 * cfg.size**2 * longest > MOST:
+        raise UsageError("that film may be too long for memory: choose fewer goals or less --size")
     picture = Picture(policy.env, cfg.size, cfg.size)
     images: list[NDArray[np.uint8]] = []
     per_second = 1 / (policy.env.dt * policy.env.action_repeat)

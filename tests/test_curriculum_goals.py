@@ -1,5 +1,6 @@
 """The curriculum around environments of Gymnasium's and agents of Stable-Baselines3."""
 
+import re
 import runpy
 import warnings
 from collections import Counter
@@ -80,6 +81,44 @@ def test_gymnasium_has_nothing_to_say_about_it():
         check_env(CurriculumGoals(point()), skip_render_check=True)
 
 
+def test_gymnasiums_vectors_take_it():
+    """Episodes that end together may have passed different numbers of places."""
+    lengths = 5, 12
+    envs = gymnasium.vector.SyncVectorEnv(
+        [
+            lambda h=h: CurriculumGoals(gymnasium.make("goalgan_bt/PointUMaze-v0", horizon=h))
+            for h in lengths
+        ]
+    )
+    envs.reset(seed=0, options={"goal": (4.0, 4.0)})
+    told = []
+    for _ in range(60):
+        info = envs.step(np.zeros((2, 2), np.float32))[4]
+        if "goal_tried" in info:
+            told += [
+                len(visited) for visited in info["goal_tried"]["visited"] if visited is not None
+            ]
+    assert {1, 2} <= set(told)
+
+
+def test_goals_of_another_size_are_refused():
+    with pytest.raises(UsageError, match="the curriculum's goals have 3 numbers"):
+        CurriculumGoals(point(), GoalCurriculum(np.zeros(3), np.ones(3)))
+    with pytest.raises(UsageError, match="goals must be rows"):
+        CurriculumGoals(point()).queue_goals((1.0, 2.0, 3.0, 4.0))
+
+
+def test_a_share_of_goals_is_from_anywhere_however_few_are_asked_for():
+    """What a GAN that has closed in on mastered goals would never hear of."""
+    curriculum = GoalCurriculum(*box(), seed=0)
+    curriculum.ask(1)
+    at = np.tile((1.0, 1.0), (20, 1))
+    curriculum.tell(at, np.ones(20), visited=at)
+    asked = np.concatenate([curriculum.ask(1) for _ in range(600)])
+    spread = np.linalg.norm(asked - (1.0, 1.0), axis=1) > 3
+    assert 0.02 < spread.mean() < 0.3
+
+
 def test_an_environment_without_goals_is_refused():
     with pytest.raises(UsageError, match="an achieved_goal and a desired_goal"):
         CurriculumGoals(gymnasium.make("CartPole-v1"))
@@ -121,8 +160,15 @@ def test_agents_of_stable_baselines_try_the_curriculums_goals(processes, tmp_pat
         vec_env_cls=SubprocVecEnv if processes else DummyVecEnv,
     )
     agent = PPO("MultiInputPolicy", envs, n_steps=50, batch_size=50, seed=0, device="cpu")
-    agent.learn(900, callback=sb3.GoalGANCallback(curriculum))
+    callback = sb3.GoalGANCallback(curriculum)
+    agent.learn(900, callback=callback)
+    before = len(curriculum.asked), len(curriculum.heard)
+    agent.learn(300, callback=callback, reset_num_timesteps=False)
     envs.close()
+    # What was queued before is dropped, so that goals never get older than that.
+    new, told = len(curriculum.asked) - before[0], len(curriculum.heard) - before[1]
+    assert told > 10 and new == told + 3 * AHEAD
+    del curriculum.asked[before[0] :], curriculum.heard[before[1] :]
     asked = Counter(tuple(goal) for goal in curriculum.asked)
     heard = Counter(tuple(goal) for goal, _ in curriculum.heard)
     # Those of the first episodes are the environments' own: they began before it was asked.
@@ -146,4 +192,14 @@ def test_the_example_runs_and_measures():
     pytest.importorskip("stable_baselines3")
     example = runpy.run_path(str(Path(__file__).parents[1] / "examples/sb3_goals.py"))
     agent = example["train"](1200, 0, True)
-    assert agent.num_timesteps >= 1200 and 0 <= example["coverage"](agent) < 0.5
+    assert agent.num_timesteps >= 1200 and agent._n_updates > 0
+    assert 0 <= example["coverage"](agent) < 0.5
+
+
+def test_the_example_of_the_documentation_runs():
+    pytest.importorskip("stable_baselines3")
+    text = (Path(__file__).parents[1] / "docs/api.md").read_text()
+    block = re.search(r"```python\n(from stable_baselines3 import SAC, Her.*?)```", text, re.S)[1]
+    made = {}
+    exec(block.replace("20_000", "1_100"), made)
+    assert made["agent"].num_timesteps >= 1100

@@ -1,6 +1,7 @@
 """`python -m goalgan_bt.demo`: trained policies that come along."""
 
 import re
+import runpy
 import subprocess
 import sys
 import time
@@ -60,6 +61,21 @@ def test_bad_words_end_in_one_line(words, problem):
     done = call("demo", *words.split())
     assert done.returncode == 2 and problem in done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+def test_shipping_tells_no_paths():
+    ship = runpy.run_path(str(ROOT / "benchmarks/ship.py"))["without_paths"]
+    words = [
+        "--seed",
+        "0",
+        "--out",
+        "/home/x/runs",
+        "--map=/home/x/my.txt",
+        "--out=/y",
+        "--iterations",
+        "4",
+    ]
+    assert ship(words) == ["--seed", "0", "--iterations", "4"]
 
 
 def test_shipping_keeps_what_the_demo_needs_and_no_more(folder, tmp_path):

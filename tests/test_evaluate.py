@@ -45,9 +45,8 @@ def test_at_home_is_what_coverage_measures(folder):
         while step is None or not (step.terminated | step.truncated).any():
             step = env.step_body(one, policy.act(env.read_states(one), goal[None]))
         reached.append(step.rewards[0])
-    assert found["episodes"] == 3 * len(goals)
-    every = evaluation.at_home(folder, len(goals), True, 0, 1)
-    assert every["success"] == found["success"]  # thrice the same, without noise
+    assert found["episodes"] == len(goals)  # without noise others would be the same
+    assert evaluation.at_home(folder, None, False, 0, 1)["episodes"] == 3 * len(goals)
     some_goals = evaluation.at_home(folder, len(goals) // 8, True, 0, 1)
     assert some_goals["success"] == pytest.approx(np.mean(reached))
 
@@ -71,6 +70,18 @@ def test_in_gymnasium_it_does_what_it_does_at_home(folder):
     # Another policy than the noisy one.
     noisy = evaluation.elsewhere(folder, "goalgan_bt/PointUMaze-v0", 40, False, 0)
     assert noisy["seconds_to_goal"] != found["seconds_to_goal"]
+
+
+def test_the_seconds_of_a_step_are_those_of_the_environment(folder):
+    robotics = pytest.importorskip("gymnasium_robotics")
+    gymnasium.register_envs(robotics)
+    body = TrainedPolicy(folder).env
+    for name, seconds in (
+        ("goalgan_bt/PointUMaze-v0", 0.02),
+        ("PointMaze_UMaze-v3", 0.01),
+        ("AntMaze_UMaze-v5", 0.05),
+    ):
+        assert evaluation.step_seconds(gymnasium.make(name), body) == pytest.approx(seconds)
 
 
 @pytest.mark.parametrize(

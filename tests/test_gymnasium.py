@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import gymnasium
@@ -15,6 +16,8 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 import goalgan_bt.gym
 from goalgan_bt import envs
+from goalgan_bt.envs.gymnasium_env import GoalGymEnv
+from goalgan_bt.envs.gymnasium_vector import GoalVectorEnv
 from goalgan_bt.gym import IDS, env_id
 
 GOALS = [one for one in IDS if "FourRooms" not in one]
@@ -56,7 +59,8 @@ def same(ours, theirs, path=""):
             assert (one is None) == (other is None), path
             if one is not None:
                 same(one, other, path)
-    elif ours is not None:
+    else:
+        assert (ours is None) == (theirs is None), path
         assert np.array_equal(ours, theirs), path
         assert np.asarray(ours).dtype == np.asarray(theirs).dtype, path
 
@@ -177,6 +181,9 @@ def test_four_rooms_end_in_the_opposite_corner():
     env.reset()
     ends = [env.step(0)[3] for _ in range(200)]
     assert ends == [False] * 199 + [True]
+    for action in (-1, 4):
+        with pytest.raises(ValueError, match="an action is a number from 0 to 3"):
+            env.step(action)
     with pytest.raises(ValueError, match="reset takes a 'state'"):
         env.reset(options={"state": 10_000})
 
@@ -211,6 +218,35 @@ def test_a_picture_shows_the_maze_and_the_goal_or_says_what_is_missing():
         pytest.skip("no EGL here")
     assert told == "(120, 160, 3) uint8 True True"
     assert drawn("off").startswith("no picture: pictures need OpenGL")
+
+
+@pytest.mark.parametrize(
+    ("settings", "problem"),
+    [
+        ({"integrator": "euler"}, "integrator is implicitfast or rk4, not 'euler'"),
+        ({"action_repeat": 0}, "action_repeat must be a whole number from 1 on, not 0"),
+        ({"horizon": -5}, "horizon must be a whole number from 1 on, not -5"),
+        ({"horizon": 2.5}, "horizon must be a whole number from 1 on, not 2.5"),
+        ({"width": 0}, "width must be a whole number from 1 on, not 0"),
+        ({"render_mode": "ascii"}, "render_mode is rgb_array"),
+    ],
+)
+@pytest.mark.parametrize("make", [GoalGymEnv, partial(GoalVectorEnv, 2)])
+def test_settings_that_there_are_not_are_named(make, settings, problem):
+    with pytest.raises(ValueError, match=re.escape(problem)):
+        make("point_umaze", **settings)
+
+
+def test_a_map_may_be_named_by_text(tmp_path):
+    file = tmp_path / "my.txt"
+    file.write_text("#####\n#S..#\n#####\n")
+    env = gymnasium.make("goalgan_bt/AntUMaze-v0", map_file=str(file)).unwrapped
+    assert len(env.sims.test_goals()) == 3 * 16
+
+
+def test_a_vector_must_be_reset_first():
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        GoalVectorEnv(2, "point_umaze").step(np.zeros((2, 2), np.float32))
 
 
 def test_what_cannot_be_drawn_is_said_when_it_is_made():

@@ -10,6 +10,7 @@ import pytest
 import torch
 from conftest import TINY, call
 
+from goalgan_bt.envs import arrays
 from goalgan_bt.envs.ant_maze import AntMaze
 from goalgan_bt.learners import onnx_policy, table
 from goalgan_bt.learners.maze import train
@@ -92,6 +93,18 @@ def test_the_traced_heading_is_that_of_the_places(dim):
     traced = onnx_policy.TracedHeading(places)(torch.from_numpy(at), torch.from_numpy(goals))
     assert np.allclose(traced.numpy(), places.heading(at, goals), atol=1e-5)
     assert (np.abs(traced.numpy() - (goals - at)).max(axis=1) > 0.1).mean() > 0.02 or dim == 1
+
+
+def test_two_exports_in_one_process_and_what_comes_after_them(tmp_path):
+    """Nothing of a trace stays behind in the constants that environments keep."""
+    folder = made(tmp_path, "--env ant_umaze")
+    for name in ("a.onnx", "b.onnx"):
+        arrays._tensor.cache_clear()
+        onnx_policy.export(folder, tmp_path / name)
+    assert (tmp_path / "a.onnx").read_bytes() == (tmp_path / "b.onnx").read_bytes()
+    env = TrainedPolicy(folder).env
+    state = torch.from_numpy(env.start_state)[None]
+    assert np.allclose(env.achieved_goals(state).numpy(), env.achieved_goals(state.numpy()))
 
 
 def test_places_that_never_moved_and_straight_ones_are_straight():

@@ -38,6 +38,7 @@ def test_a_film_shows_the_body_on_its_way_and_says_how_it_ended(folder, tmp_path
         ("--video x.mp4 --goal 1", "--goal takes 2 numbers for each goal, not 1"),
         ("--video x.mp4 --goal 0 2", "--goal 0 2 is inside a wall"),
         ("--video x.mp4 --size 65", "--size must be even"),
+        ("--video x.mp4 --size 2048" + " --goal" + 999 * " 0 0", "may be too long for memory"),
         ("--video x.mp4 --size 10", "--size must be between 64 and 2048"),
         ("", "--video"),
     ],

@@ -255,7 +255,9 @@ class GoalCurriculum:
             good = self._intermediate(goals, self.estimator(goals))
             goals = goals[np.argsort(~good, kind="stable")[:n]]
             self.rng.shuffle(goals)
-        if k := round(self.cfg.anywhere * n):
+        whole, rest = divmod(self.cfg.anywhere * n, 1)
+        # Of few goals at a time each may be that one.
+        if k := int(whole) + (rest > 0 and self.rng.random() < rest):
             goals[:k] = self.uniform(k)
         return goals
 

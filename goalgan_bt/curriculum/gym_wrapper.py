@@ -73,15 +73,30 @@ class CurriculumGoals(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
         spaces = getattr(env.observation_space, "spaces", {})
         if not {"achieved_goal", "desired_goal"} <= set(spaces):
             raise UsageError("observations must have an achieved_goal and a desired_goal")
+        self._goal = np.zeros(spaces["desired_goal"].shape)
+        if curriculum is not None and curriculum.low.shape != self._goal.shape:
+            raise UsageError(
+                f"the curriculum's goals have {len(curriculum.low)} numbers, "
+                f"the environment's {self._goal.shape}"
+            )
         self._curriculum, self._start = curriculum, begin
         self._queued: deque[FloatArray] = deque()
-        self._goal = np.zeros(spaces["desired_goal"].shape)
         self._visited: list[FloatArray] = []
         self._success, self._steps = False, 0
 
-    def queue_goals(self, goals: ArrayLike) -> None:
-        """Goals for the next episodes, (n, goal_dim), one each."""
-        self._queued.extend(np.array(goals, dtype=float).reshape(-1, len(self._goal)))
+    def queue_goals(self, goals: ArrayLike, anew: bool = False) -> None:
+        """Goals for the next episodes, (n, goal_dim) or one of them; those that are queued already
+        come first, or with `anew` are dropped.
+
+        Raises:
+            UsageError: for arrays that are no such goals.
+        """
+        rows = np.atleast_2d(np.array(goals, dtype=float))
+        if rows.ndim != 2 or rows.shape[1:] != self._goal.shape:
+            raise UsageError(f"goals must be rows of {self._goal.shape} numbers, not {rows.shape}")
+        if anew:
+            self._queued.clear()
+        self._queued.extend(rows)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -99,7 +114,7 @@ class CurriculumGoals(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Take a step; the info of an episode's last has `goal_tried`: the goal, whether it was
-        reached, and places that were passed, (m, goal_dim).
+        reached, and places that were passed, a list of (goal_dim,).
 
         Raises:
             UsageError: where the info does not say whether the goal is reached.
@@ -116,7 +131,7 @@ class CurriculumGoals(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
             tried = {
                 "goal": self._goal,
                 "success": self._success,
-                "visited": np.array(self._visited),
+                "visited": self._visited,
             }
             info = info | {TRIED: tried}
             if self._curriculum is not None:
@@ -128,6 +143,6 @@ def tell(curriculum: GoalCurriculum, episodes: list[dict[str, Any]]) -> dict[str
     """Tell a curriculum of episodes as `goal_tried` has them; returns what it tells."""
     goals: NDArray[Any] = np.stack([episode["goal"] for episode in episodes])
     success = [episode["success"] for episode in episodes]
-    visited = np.concatenate([episode["visited"] for episode in episodes])
+    visited = np.array([place for episode in episodes for place in episode["visited"]])
     inside = ((goals >= curriculum.low) & (goals <= curriculum.high)).all(axis=1)
     return curriculum.tell(goals[inside], np.array(success, dtype=float)[inside], visited)

@@ -33,7 +33,7 @@ class GoalGANCallback(BaseCallback):
                 "make_vec_env(..., wrapper_class=CurriculumGoals)"
             )
         for i in range(envs.num_envs):
-            envs.env_method("queue_goals", self.curriculum.ask(AHEAD), indices=[i])
+            envs.env_method("queue_goals", self.curriculum.ask(AHEAD), anew=True, indices=[i])
 
     def _on_step(self) -> bool:
         ended = [i for i, info in enumerate(self.locals["infos"]) if TRIED in info]

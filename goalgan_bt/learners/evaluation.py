@@ -35,7 +35,8 @@ def at_home(
 
     Args:
         folder: the run folder; its last checkpoint counts.
-        episodes: in all, spread evenly over the test goals; three for each if None.
+        episodes: in all, spread evenly over the test goals; three for each if None. Without noise
+            at most one for each: all others would be the same.
         deterministic: without the noise of exploration.
         seed: of that noise.
         threads: simulation threads, 0 for one per core.
@@ -47,6 +48,8 @@ def at_home(
     policy, iteration = load_policy(env, cfg, folder)
     tested = env.test_goals()
     n = PER_GOAL * len(tested) if episodes is None else episodes
+    if deterministic:
+        n = min(n, len(tested))
     goals = tested[spread(n, len(tested))]
     noise = None if deterministic else torch.Generator().manual_seed(seed)
     done = Attempted(np.zeros(n, bool), np.zeros(n, bool), np.zeros(n))
@@ -91,12 +94,13 @@ def elsewhere(
     done = Attempted(np.zeros(n, bool), np.zeros(n, bool), np.zeros(n))
     returns = np.zeros(n)
     duration = step_seconds(env, policy.env)
+    repeat = max(1, round(policy.env.action_repeat * policy.env.dt / duration))  # as long as there
     try:
         for i in range(n):
             obs, _ = env.reset(seed=seed + i)
             ended, action, actions = False, np.zeros(0), 0
             while not ended:
-                if actions % policy.env.action_repeat == 0:  # held as long as in training
+                if actions % repeat == 0:
                     state = state_of(obs, policy.env, name)
                     action = policy.act(state, obs["desired_goal"], deterministic)
                 obs, reward, terminated, truncated, info = env.step(
@@ -116,8 +120,11 @@ def elsewhere(
 
 
 def step_seconds(env: Any, body: GoalEnv) -> float:
-    """How long a step of an environment is: as it says, or as the body's own."""
-    return float(getattr(env.unwrapped, "dt", body.dt))
+    """How long a step of an environment is: as it says, or the robot inside it (gymnasium-robotics'
+    mazes), or as the body's own."""
+    inner = env.unwrapped
+    known = (inner, *(getattr(inner, name, None) for name in ("point_env", "ant_env", "sims")))
+    return next((float(one.dt) for one in known if hasattr(one, "dt")), body.dt)
 
 
 def state_of(obs: Any, body: GoalEnv, name: str) -> NDArray[np.float64]:

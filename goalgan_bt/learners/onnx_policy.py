@@ -12,11 +12,10 @@ from torch import Tensor, nn
 
 from goalgan_bt.agent.policy import GaussianPolicy
 from goalgan_bt.envs.goal_env import GoalEnv
-from goalgan_bt.learners.maze_config import MazeConfig
-from goalgan_bt.learners.maze_learner import load_policy, places_of
+from goalgan_bt.learners.maze_learner import load_policy
 from goalgan_bt.learners.trained_policy import world_of
 from goalgan_bt.recall.places import AROUND, Places
-from goalgan_bt.runs import checkpoint, run_folder
+from goalgan_bt.runs import run_folder
 from goalgan_bt.runs.errors import UsageError
 
 OPSET = 20
@@ -126,17 +125,9 @@ def traced(folder: Path) -> tuple[TracedPolicy, GoalEnv]:
     """
     cfg, env = world_of(folder, 1)
     policy, _ = load_policy(env, cfg, folder)
-    return TracedPolicy(env, policy, recalled(env, cfg, folder)).eval(), env
-
-
-def recalled(env: GoalEnv, cfg: MazeConfig, folder: Path) -> Places | None:
-    """The places that the policy of a run takes along; None if it sees no heading."""
-    if not cfg.places.heading:
-        return None
-    places = places_of(env, cfg)
-    with checkpoint.saved(folder) as state:
-        places.load_state_dict(state["learner"]["places"])
-    return places
+    # Those that the policy takes along: it has come with them.
+    places = None if env.heading is None else env.heading.__self__  # type: ignore[attr-defined]
+    return TracedPolicy(env, policy, places).eval(), env
 
 
 def export(folder: Path, path: Path) -> None:
@@ -150,6 +141,7 @@ def export(folder: Path, path: Path) -> None:
     graph, env = traced(folder)
     state = torch.from_numpy(env.start_state).repeat(2, 1)
     goal = torch.from_numpy(env.test_goals()[:2])
+    graph(state, goal)  # makes the constants that arrays.py keeps: traced ones would stay behind
     n = torch.export.Dim("n", min=1)
     program: Any = torch.onnx.export(
         graph,
