@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from goalgan_bt.agent.networks import MLP, TANH, Linearised
+from goalgan_bt.agent.networks import MLP, TANH, Linearised, tanh_
 from goalgan_bt.agent.settings import PolicyConfig, ValueConfig
 from goalgan_bt.runs import checkpoint, ranks
 
@@ -122,7 +122,7 @@ class Actor:
         x = normalise(torch.from_numpy(obs), self._shift, self._scale)
         h = x
         for weight, bias in self._hidden:
-            h = torch.addmm(bias, h, weight).tanh_()
+            h = tanh_(torch.addmm(bias, h, weight))
         weight, bias = self._output
         actions = torch.addmm(bias, h, weight).addmm_(x, self._skip)
         if noise is not None:

@@ -61,14 +61,14 @@ class TracedHeading(nn.Module):
         ends = self.ends[(torch.round(self.on_lattice(goals)).long() * self.strides).sum(dim=1)]
         corners, weights = self.around(places)
         mean = (weights[..., None] * self.table[ends[:, None], corners]).sum(dim=1)
-        recalled, last_leg = mean[:, 1] / mean[:, 0].clamp(min=1e-6), goals - self.places[ends]
+        recalled, last_leg = mean[:, 1] / mean[:, 0].clamp(min=1e-30), goals - self.places[ends]
         left = recalled + torch.linalg.vector_norm(last_leg, dim=1)
         along = recalled[:, None] * unit(mean[:, 2:]) + last_leg
         as_seen = (straight < self.near) & (left < AROUND * straight + 2 * self.cell)
-        as_seen |= (recalled < 2 * self.cell) | (straight < self.cell) | (mean[:, 0] < 1e-6)
+        as_seen |= (recalled < 2 * self.cell) | (straight < self.cell)
         length = torch.where(as_seen, straight, left)
-        turned = as_seen | ~(along.square().sum(dim=1) > 1e-12)
-        return length[:, None] * torch.where(turned[:, None], unit(direct), unit(along))
+        turned = as_seen | (along.square().sum(dim=1) < 1e-12)
+        return length[:, None] * unit(torch.where(turned[:, None], direct, along))
 
     def on_lattice(self, points: Tensor) -> Tensor:
         """Points (n, goal_dim) in units of the lattice."""

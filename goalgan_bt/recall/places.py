@@ -28,12 +28,14 @@ from goalgan_bt.recall.settings import PlacesConfig
 from goalgan_bt.runs.errors import UsageError
 from goalgan_bt.runs.ranges import require, require_box
 
+Float32 = NDArray[np.float32]
 Nodes = NDArray[np.int64]  # places by number, in the order in which they were found
 NEAR = 1.2  # success radii: a goal in sight and as near as that is where one sees it
 MOST = 20_000_000  # ways in memory: 16 bytes each in two dimensions
 AT_ONCE = 1_000_000  # of which so many are searched at a time
 AROUND = 1.5  # times the straight line: a way that is longer leads around something
 ONCE = 0.5  # moves that count for less are forgotten
+LISTED = 1_000_000  # points of a lattice whose numbers are looked up in a list, not searched
 
 
 class Ways(NamedTuple):
@@ -59,7 +61,7 @@ class Tabulated(NamedTuple):
     numbers: Nodes
     ends: Nodes
     places: FloatArray
-    table: NDArray[np.float32]
+    table: Float32
 
 
 class Places:
@@ -113,16 +115,17 @@ class Places:
                 f"origins and ends must be (n, T, {len(self._low)}), as many of both, "
                 f"not {origins.shape} and {ends.shape}"
             )
-        self._visit(np.concatenate([origins, ends]).reshape(-1, len(self._low)))
-        begun, ended = self._find(self._keys_of(origins)), self._find(self._keys_of(ends))
+        points = np.stack([origins, ends])
+        keys = self._keys_of(points)
+        self._visit(keys[np.isfinite(squared(points))])  # a diverged body is nowhere
+        begun, ended = self._find(keys)
         episode = np.zeros(begun.shape, np.int64)
-        episode[:, 1:] = (origins[:, 1:] != ends[:, :-1]).any(axis=2).cumsum(axis=1)
+        episode[:, 1:] = (squared(origins[:, 1:] - ends[:, :-1]) != 0).cumsum(axis=1)
         made = [np.empty((2, 0), np.int64)]
         for lag in self.cfg.lags:
             first, last = slice(max(0, begun.shape[1] - lag + 1)), slice(lag - 1, None)
-            with np.errstate(invalid="ignore"):  # a diverged body is not near
-                squared = np.square(ends[:, last] - origins[:, first]).sum(axis=2)
-            move = (squared <= self.cfg.reach**2) & (episode[:, first] == episode[:, last])
+            near = squared(ends[:, last] - origins[:, first]) <= self.cfg.reach**2
+            move = near & (episode[:, first] == episode[:, last])
             move &= begun[:, first] != ended[:, last]
             made.append(np.stack([begun[:, first][move], ended[:, last][move]]))
         a, b = np.concatenate(made, axis=1)
@@ -144,7 +147,7 @@ class Places:
         """
         k, dim = self.places.shape
         a, b = self.moves.nonzero()
-        length = np.sqrt(np.square(self.places[b] - self.places[a]).sum(axis=1))
+        length = np.sqrt(squared(self.places[b] - self.places[a]))
         made = csr_array((length, (a, b)), shape=(k, k))
         either = csr_array(made.maximum(made.T))
         back = self.cfg.backward
@@ -163,26 +166,27 @@ class Places:
         """The ways from places to goals, both (n, goal_dim): to the place visited that is nearest
         to the goal, and straight on from there. Straight lines where nothing is known."""
         offsets = goals - places
-        straight = np.sqrt(np.square(offsets).sum(axis=1))
-        direct = offsets / np.maximum(straight, 1e-9)[:, None]
+        straight = np.sqrt(squared(offsets))
         if self.cfg.way == "straight" or not self._costs.nnz or not len(places):
-            return Ways(straight, direct)
+            return Ways(straight, unit(offsets))
         rows, ends = self._rows_of(goals)
         corners, weights = self._around(places)
-        np.minimum(corners, self._table.shape[1] - 1, out=corners)  # new since the last refresh
-        mean = np.einsum("nc,ncf->nf", weights, self._table[rows[:, None], corners])
-        recalled, last_leg = mean[:, 1] / np.maximum(mean[:, 0], 1e-6), goals - self.places[ends]
-        left = recalled + np.sqrt(np.square(last_leg).sum(axis=1))
+        width = self._table.shape[1]
+        np.minimum(corners, width - 1, out=corners)  # new since the last refresh
+        corners += (rows * width)[:, None]  # -1 is the end of the row before: as empty as any
+        known = self._table.reshape(-1, self._table.shape[2]).take(corners, axis=0)
+        mean = np.einsum("nc,ncf->nf", weights, known)
+        recalled, last_leg = mean[:, 1] / np.maximum(mean[:, 0], 1e-30), goals - self.places[ends]
+        left = recalled + np.sqrt(squared(last_leg))
         along = recalled[:, None] * unit(mean[:, 2:]) + last_leg
         # The goal is where one sees it: near and in sight, from the end of what is known on, and
-        # where no way leads or nobody has been (optimism, which finds short cuts).
+        # where no way leads or nobody has been, so that 0 m are (optimism, which finds short cuts).
         cell = self.cfg.cell
         as_seen = (straight < self.near) & (left < AROUND * straight + 2 * cell)
-        as_seen |= (recalled < 2 * cell) | (straight < cell) | (mean[:, 0] < 1e-6)
-        turned = as_seen | ~(np.square(along).sum(axis=1) > 1e-12)
-        return Ways(
-            np.where(as_seen, straight, left), np.where(turned[:, None], direct, unit(along))
-        )
+        as_seen |= (recalled < 2 * cell) | (straight < cell)
+        turned = as_seen | (squared(along) < 1e-12)
+        along[turned] = offsets[turned]
+        return Ways(np.where(as_seen, straight, left), unit(along))
 
     def heading(self, places: FloatArray, goals: FloatArray) -> FloatArray:
         """Offsets from places to goals, (n, goal_dim) each, along the way: as far as the way is
@@ -245,12 +249,14 @@ class Places:
         self._keys = keys
         self._order = np.argsort(keys)
         self._sorted = keys[self._order]
+        self._list = np.full(points if (points := self._sides.prod()) <= LISTED else 0, -1)
+        if len(self._list):
+            self._list[keys] = np.arange(len(keys))
         self.places = self._points(keys)
 
-    def _visit(self, points: FloatArray) -> None:
-        """Give the places nearest to points (n, goal_dim) numbers, if they have none."""
-        there = points[np.isfinite(points).all(axis=1)]  # a diverged body is nowhere
-        new = np.setdiff1d(self._keys_of(there), self._keys)
+    def _visit(self, keys: Nodes) -> None:
+        """Give the places with those keys, (n,), numbers, if they have none."""
+        new = np.setdiff1d(keys, self._keys)
         if len(new):
             self._number(np.concatenate([self._keys, new]))
 
@@ -268,12 +274,14 @@ class Places:
 
     def _find(self, keys: Nodes) -> Nodes:
         """Numbers of the places with those keys, -1 for those never visited."""
+        if len(self._list):
+            return self._list[keys]
         if not len(self._keys):
             return np.full(keys.shape, -1)
         at = np.minimum(np.searchsorted(self._sorted, keys), len(self._keys) - 1)
         return np.where(self._sorted[at] == keys, self._order[at], -1)
 
-    def _around(self, points: FloatArray) -> tuple[Nodes, FloatArray]:
+    def _around(self, points: FloatArray) -> tuple[Nodes, Float32]:
         """Points (n, goal_dim) as weighted means of the corners of Kuhn's simplex around each (as
         Davies 1997 interpolates), goal_dim + 1 of them, not all of which were visited.
 
@@ -282,13 +290,15 @@ class Places:
         """
         x = self._on_lattice(points)
         first = x.astype(np.int64)
-        order = np.argsort(first - x, axis=1)  # the axis along which it is farthest comes first
-        weights = np.ones((len(x), x.shape[1] + 1))
-        weights[:, 1:] = np.take_along_axis(x - first, order, axis=1)
+        behind = first - x
+        order = np.argsort(behind, axis=1)  # the axis along which it is farthest comes first
+        weights = np.ones((len(x), x.shape[1] + 1), np.float32)
+        np.negative(np.sort(behind, axis=1), out=weights[:, 1:])
         weights[:, :-1] -= weights[:, 1:]
         keys = np.zeros(weights.shape, np.int64)
-        keys[:, 1:] = self._strides[order].cumsum(axis=1)
-        return self._find(keys + (first @ self._strides)[:, None]), weights
+        self._strides[order].cumsum(axis=1, out=keys[:, 1:])
+        keys += (first @ self._strides)[:, None]
+        return self._find(keys), weights
 
     # The ways.
 
@@ -342,8 +352,13 @@ def lattice(low: FloatArray, high: FloatArray, cfg: PlacesConfig) -> NDArray[np.
 
 def unit(vectors: FloatArray) -> FloatArray:
     """Vectors (..., goal_dim) of length 1; zero stays zero."""
-    length = np.sqrt(np.square(vectors).sum(axis=-1, keepdims=True))
-    return np.asarray(vectors / np.maximum(length, 1e-9))
+    length = np.sqrt(squared(vectors))
+    return np.asarray(vectors / np.maximum(length, 1e-9)[..., None])
+
+
+def squared(vectors: FloatArray) -> FloatArray:
+    """Their squared lengths, (..., goal_dim) -> (...), not a number where they are not finite."""
+    return np.asarray(np.einsum("...d,...d->...", vectors, vectors))
 
 
 def slopes(places: FloatArray, neighbours: csr_array) -> list[csr_array]:
@@ -361,7 +376,7 @@ def slopes(places: FloatArray, neighbours: csr_array) -> list[csr_array]:
     np.add.at(spread, a, steps[:, :, None] * steps[:, None, :])
     # Neighbours in a row have a slope along it only.
     spread += 1e-6 * spread.max(initial=1e-12) * np.eye(dim)
-    weights = np.linalg.solve(spread[a], steps[:, :, None])[:, :, 0]
+    weights = np.einsum("nij,nj->ni", np.linalg.inv(spread)[a], steps)
     matrices = []
     for column in weights.T:
         rise = csr_array((column, (a, b)), shape=(k, k))
