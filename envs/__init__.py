@@ -4,9 +4,10 @@
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from goalgan_bt.envs import maze as mazes
+from goalgan_bt.envs import own
 
 if TYPE_CHECKING:
     from goalgan_bt.envs.goal_env import GoalEnv
@@ -32,11 +33,11 @@ def make(
     """N simulations of the environment of that name.
 
     Args:
-        name: one of `NAMES`.
+        name: one of `NAMES`, or one's own (see `goalgan_bt.envs.own`).
         num_envs: N.
         threads: simulation threads, 0 for one per core.
-        horizon: steps of an episode. If None: 200 for a point and 500 for an Ant in the U-maze,
-            and in other mazes more, in proportion to the longest way from the start.
+        horizon: steps of an episode. If None: 200 for a point, 500 for an Ant in the U-maze, and
+            in other mazes more, in proportion to the longest way from the start.
         action_repeat: steps for which each action is held.
         integrator: `implicitfast` or `rk4`, for MuJoCo bodies.
         dim: dimensions of `point_nd`, 2 to 6.
@@ -50,11 +51,13 @@ def make(
         PhysicsError: for `warp` where there is none (see `goalgan_bt.envs.warp_batch`).
         MapError: for a map that is not a maze.
     """
-    if name not in NAMES:
+    mine = own.find(name)
+    if mine is None and name not in NAMES:
         raise ValueError(f"unknown environment {name!r}: choose one of {', '.join(NAMES)}")
     # Only now: MuJoCo takes half a second to import, and `--help` needs the names only.
     from goalgan_bt.envs.ant_maze import AntMaze
     from goalgan_bt.envs.goal_env import PhysicsError
+    from goalgan_bt.envs.mujoco_env import MazeEnv
     from goalgan_bt.envs.point_maze import PointMaze
     from goalgan_bt.envs.point_nd import PointND
 
@@ -64,13 +67,25 @@ def make(
         if physics == "warp":
             raise PhysicsError("point_nd is no MuJoCo model: warp goes with point_... and ant_...")
         return PointND(dim, num_envs, horizon or 200, action_repeat)
-    body, layout = name.split("_")
-    constructor = {"point": PointMaze, "ant": AntMaze}[body]
+    make_body: Any
+    if mine is None:
+        body, layout = name.split("_")
+        make_body = {"point": PointMaze, "ant": AntMaze}[body]
+    else:
+        make_body, layout = mine.make, "umaze"
+        body = name.rpartition(":")[2].lower()
+        if not (isinstance(make_body, type) and issubclass(make_body, MazeEnv)):
+            if map_file is not None:
+                raise mazes.MapError(f"{name} has no maze: it takes no map")
+            env = make_body(num_envs, horizon, action_repeat, threads)
+            env.name = body
+            return env
     if maze is None:
         maze = mazes.layout(layout) if map_file is None else mazes.load(map_file)
     if horizon is None:
+        usual = HORIZON[body] if mine is None else make_body.usual_horizon
         scale = maze.longest_path / mazes.layout("umaze").longest_path
-        horizon = max(HORIZON[body], 100 * round(HORIZON[body] * scale / 100))
-    env = constructor(maze, integrator, num_envs, horizon, action_repeat, threads, physics, device)
-    env.name = name if map_file is None else f"{body}_{map_file.stem}"
+        horizon = max(usual, 100 * round(usual * scale / 100))
+    env = make_body(maze, integrator, num_envs, horizon, action_repeat, threads, physics, device)
+    env.name = f"{body}_{layout if map_file is None else map_file.stem}"
     return env

@@ -16,6 +16,7 @@ import numpy as np
 from goalgan_bt.envs.arrays import Array, columns, like, namespace
 from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
 from goalgan_bt.envs.mujoco_env import INTEGRATORS, MazeEnv, add_walls
+from goalgan_bt.envs.rotations import ahead_and_left, axes_on_map, unit_on_map
 
 TORSO_RADIUS = 0.25  # m
 LEG_RADIUS = 0.08  # m
@@ -98,7 +99,7 @@ class AntMaze(MazeEnv):
             self._seen = states.copy(), goals.copy(), turns
         states = renumbered(states, turns)
         along_x, _, along_z = axes_on_map(states[:, 3:7])
-        front = along_x / (_length(along_x) + 1e-9)
+        front = unit_on_map(along_x)
         straight, offset = self.squashed(goals - achieved), self.squashed(along)
         shape = (states.shape[0], self.obs_dim)  # and no len(): that cannot be traced
         obs = xp.empty(shape, dtype=xp.float32, device=states.device)
@@ -106,10 +107,10 @@ class AntMaze(MazeEnv):
             obs[:, :29], obs[:, 29:31], obs[:, 31:33] = states, straight, front
         else:
             obs[:, 0], obs[:, 1:9], obs[:, 9:21] = states[:, 2], states[:, 7:15], states[:, 17:]
-            obs[:, 21], obs[:, 22] = _ahead_and_left(straight, front)
-        obs[:, -6], obs[:, -5] = _ahead_and_left(offset, front)
-        obs[:, -4], obs[:, -3] = _ahead_and_left(states[:, 15:17], front)
-        obs[:, -2], obs[:, -1] = _ahead_and_left(along_z, front)
+            obs[:, 21], obs[:, 22] = ahead_and_left(straight, front)
+        obs[:, -6], obs[:, -5] = ahead_and_left(offset, front)
+        obs[:, -4], obs[:, -3] = ahead_and_left(states[:, 15:17], front)
+        obs[:, -2], obs[:, -1] = ahead_and_left(along_z, front)
         return obs
 
     def to_body(self, actions: Array, states: Array, goals: Array) -> Array:
@@ -188,7 +189,7 @@ def quarter_turns(states: Array, goals: Array) -> Array:
     xp = namespace(states)
     w, x, y, z = columns(states[:, 3:7])
     front = xp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)])  # the x axis on the map
-    ahead, left = _ahead_and_left(goals - states[:, :2], front.T)
+    ahead, left = ahead_and_left(goals - states[:, :2], front.T)
     turns = xp.where(abs(ahead) >= abs(left), 1 - xp.sign(ahead), 2 - xp.sign(left))
     return xp.asarray(turns, dtype=xp.int64)
 
@@ -229,29 +230,3 @@ def _renumber_actions(actions: Array, turns: Array) -> Array:
 def _rows(array: Array) -> Array:
     """Indices that pick from every row, (n, 1)."""
     return namespace(array).arange(array.shape[0], device=array.device)[:, None]
-
-
-def _length(vector: Array) -> Array:
-    """Lengths of vectors in the plane, (n, 2) -> (n, 1)."""
-    return namespace(vector).sqrt(vector[:, :1] ** 2 + vector[:, 1:] ** 2)
-
-
-def _ahead_and_left(vector: Array, front: Array) -> tuple[Array, Array]:
-    """Components of vectors (n, 2) along fronts (n, 2) and to their left, each (n,)."""
-    ahead = vector[:, 0] * front[:, 0] + vector[:, 1] * front[:, 1]
-    left = vector[:, 1] * front[:, 0] - vector[:, 0] * front[:, 1]
-    return ahead, left
-
-
-def axes_on_map(quaternion: Array) -> Array:
-    """Where unit quaternions (w, x, y, z), (n, 4), turn the x, y and z axes: the first two
-    components of each, (3, n, 2)."""
-    w, x, y, z = columns(quaternion)
-    axes = namespace(quaternion).empty((3, quaternion.shape[0], 2), device=w.device)
-    axes[0, :, 0] = 1 - 2 * (y * y + z * z)
-    axes[0, :, 1] = 2 * (x * y + w * z)
-    axes[1, :, 0] = 2 * (x * y - w * z)
-    axes[1, :, 1] = 1 - 2 * (x * x + z * z)
-    axes[2, :, 0] = 2 * (x * z + w * y)
-    axes[2, :, 1] = 2 * (y * z - w * x)
-    return axes

@@ -60,7 +60,9 @@ class GoalEnv:
         heading: tells offsets to goals along the way, where somebody knows the ways. Observations
             then hold these, and not where the body is: with a way to follow it need not know, and
             what it learns at one place holds for all (docs/LOG.md).
-        start_state: (state_dim,) where episodes begin.
+        start_state: (state_dim,) where episodes begin; of those whose states are not `settable`,
+            where one of them began.
+        settable: whether states can be written.
         goal_low, goal_high: (goal_dim,) the box in which goals are proposed, metres.
         maze: the layout, or None where there are no walls.
         goals: (N, goal_dim) the desired goals; elapsed: (N,) steps since the last reset.
@@ -75,6 +77,7 @@ class GoalEnv:
     goal_high: FloatArray
     maze: Maze | None = None
     heading: Heading | None = None
+    settable = True
 
     def __init__(self, num_envs: int, horizon: int, action_repeat: int) -> None:
         self.num_envs = num_envs

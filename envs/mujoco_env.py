@@ -16,7 +16,7 @@ from goalgan_bt.envs.maze import FloatArray, Maze
 
 
 class MujocoEnv(GoalEnv):
-    """A `GoalEnv` on MuJoCo; the state is qpos and qvel.
+    """A `GoalEnv` on MuJoCo; the state is qpos, qvel, and activations where there are any.
 
     Args:
         model: the compiled model.
@@ -64,7 +64,7 @@ class MujocoEnv(GoalEnv):
 def _batch(
     model: mujoco.MjModel, num_envs: int, threads: int, physics: str, device: str
 ) -> tuple[Any, Any]:
-    """The simulations, and their states as rows of qpos and qvel."""
+    """The simulations, and their states as rows of qpos, qvel and activations."""
     if physics == "warp":
         from goalgan_bt.envs.warp_batch import WarpBatch
 
@@ -73,8 +73,8 @@ def _batch(
     # A diverged simulation must end its episode, not be put back silently (Warp's never is).
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     batch = Batch(model, num_envs, threads)
-    # A state row of MuJoCo is time, qpos, qvel, ...: ours is a slice of it, read in one go.
-    rows = batch.state[:, 1 : 1 + model.nq + model.nv]
+    # A state row of MuJoCo is time, qpos, qvel, act, ...: ours is a slice of it, read in one go.
+    rows = batch.state[:, 1 : 1 + model.nq + model.nv + model.na]
     assert np.shares_memory(rows[:, : model.nq], batch.bind("qpos"))
     return batch, rows
 

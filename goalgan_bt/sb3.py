@@ -7,7 +7,8 @@ traces, as callbacks.
 The callbacks themselves are in `goalgan_bt.learners`: `curriculum_callback`, `stable_baselines`.
 """
 
-from goalgan_bt.curriculum.gym_wrapper import CurriculumGoals, goal_as_attribute, goal_as_option
+from goalgan_bt.curriculum.gym_wrapper import CurriculumGoals
+from goalgan_bt.envs.gym_goals import goal_as_attribute, goal_as_option
 from goalgan_bt.learners.curriculum_callback import GoalGANCallback
 from goalgan_bt.learners.stable_baselines import RecallTraces
 from goalgan_bt.recall.settings import RecallConfig

@@ -23,6 +23,7 @@ SETUP = (
     "pip install",
     "printf",
     "head=",
+    "export ",
 )  # and no command of ours
 SMALL = (
     "--iterations 1 --rollout.num-envs 8 --rollout.steps 5 --coverage.rollouts 1 --gan.steps 2 "
@@ -59,10 +60,26 @@ def filled(words, folder):
     return shlex.split(re.sub(r"\bS\b", "3", words))
 
 
+def put_files_of_the_page(folder):
+    """What docs/custom_env.md lets its reader write."""
+    text = (ROOT / "docs/custom_env.md").read_text()
+    robot, _, tasks = re.findall(r"```python\n(.*?)```", text, re.S)
+    (field,) = re.findall(r"```\n(#.*?)```", text, re.S)
+    assert robot == (ROOT / "examples/quadruped.py").read_text()
+    assert field == (ROOT / "examples/field.txt").read_text()
+    for name, content in {"quadruped.py": robot, "my_tasks.py": tasks, "field.txt": field}.items():
+        (folder / name).write_text(content)
+
+
 @pytest.mark.parametrize("words", of("train"))
 def test_every_documented_training_runs(words, tmp_path, folder, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "my_maze.txt").write_text("#####\n#...#\n###.#\n#S..#\n#####\n")
+    if own := re.search(r"--env (\w+):\w+", words):
+        put_files_of_the_page(tmp_path)
+        monkeypatch.syspath_prepend(tmp_path)
+        if own[1] == "quadruped":
+            pytest.importorskip("dm_control")
     argv = filled(words, folder)
     if "--help" in argv:
         assert call("train", *argv).returncode == 0

@@ -197,7 +197,7 @@ class Collector:
                 anew = done[~chained]
                 self._reset(anew, following[~chained])
                 # Both are copies of this step; what was reached is computed only once.
-                states[anew], achieved[anew] = env.start_state, self._start_achieved
+                states[anew], achieved[anew] = self._begun(anew)
             obs = env.observations(states, env.goals, achieved)
 
         rollouts = Rollouts(
@@ -220,7 +220,14 @@ class Collector:
         self.env.reset(ids, goals)
         self._from_start[ids] = True
         self._age[ids] = 0
-        self._states[0, ids] = self.env.start_state
+        self._states[0, ids] = self._begun(ids)[0]
+
+    def _begun(self, ids: Ids) -> tuple[FloatArray, FloatArray]:
+        """States in which episodes have begun and where those are, of each or of all of them."""
+        if self.env.settable:
+            return self.env.start_state, self._start_achieved
+        states = self.env.read_states(ids)
+        return states, self.env.achieved_goals(states)
 
     def _chain(self, ids: Ids, goals: FloatArray) -> None:
         if len(ids) == 0:

@@ -9,7 +9,6 @@ episode ends holds what the curriculum shall hear (`goalgan_bt.sb3.GoalGANCallba
 """
 
 from collections import deque
-from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -17,33 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from goalgan_bt.curriculum.curriculum import GoalCurriculum
+from goalgan_bt.envs.gym_goals import Begin, goal_as_option
 from goalgan_bt.envs.maze import FloatArray
 from goalgan_bt.runs.errors import UsageError
 
 TRIED = "goal_tried"  # the key of an info that tells how an episode went
 EVERY = 10  # steps between two places that the curriculum hears of
-
-# Begins an episode with a goal: environment, goal (goal_dim,), seed -> observation, info.
-Begin = Callable[[gymnasium.Env[Any, Any], FloatArray, int | None], tuple[Any, dict[str, Any]]]
-
-
-def goal_as_option(
-    env: gymnasium.Env[Any, Any], goal: FloatArray, seed: int | None
-) -> tuple[Any, dict[str, Any]]:
-    """For environments whose `reset` takes a `goal` among its options, as ours do."""
-    return env.reset(seed=seed, options={"goal": goal})
-
-
-def goal_as_attribute(
-    env: gymnasium.Env[Any, Any], goal: FloatArray, seed: int | None
-) -> tuple[Any, dict[str, Any]]:
-    """For environments that hold the goal of an episode as `goal`, as gymnasium-robotics' do."""
-    obs, info = env.reset(seed=seed)
-    inner: Any = env.unwrapped
-    inner.goal = np.asarray(goal, dtype=np.asarray(obs["desired_goal"]).dtype).copy()
-    if hasattr(inner, "update_target_site_pos"):  # mazes show it
-        inner.update_target_site_pos()
-    return obs | {"desired_goal": inner.goal.copy()}, info
 
 
 class CurriculumGoals(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):

@@ -55,7 +55,7 @@ def train(cfg: MazeConfig, folder: Path | None, stop: Stop | None = None) -> Tra
     """
     torch.set_num_threads(cfg.learning_threads)
     env = make_env(cfg, envs_per_rank(cfg))
-    test_env = make_env(cfg, TEST_ENVS)
+    test_env = make_env(cfg, TEST_ENVS if env.settable else env.num_envs)
     learner = MazeLearner(env, cfg)
     test_env.heading = env.heading
     covered = math.nan
@@ -132,6 +132,12 @@ def prepared(cfg: MazeConfig) -> Iterator[World]:
     try:
         envs_per_rank(cfg)  # or there will be no run
         env = make_env(cfg, 1)
+        set_states = cfg.rollout.chain > 0 or cfg.imitation.source in ("traces", "forward")
+        if set_states and not env.settable:
+            raise UsageError(
+                f"the states of {env.name} cannot be set, as chained episodes and traces of full "
+                "states need it: --rollout.chain 0 and another --method"
+            )
         yield World(env.name, env.maze)
     finally:
         ranks.end()

@@ -2,9 +2,10 @@
 
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from goalgan_bt import envs
 from goalgan_bt.agent.settings import (
@@ -31,7 +32,8 @@ class MazeConfig(RunConfig):
     are those of the environment given with --env, or of ant_umaze."""
 
     env: str = "ant_umaze"
-    """Environment: {point,ant}_{umaze,spiral,medium,large} or point_nd. Picks the preset."""
+    """Environment: {point,ant}_{umaze,spiral,medium,large}, point_nd, or one's own as
+    module:factory. Picks the preset."""
     method: str = "recall_traces"
     """What to learn with: recall_traces (over places), recall_traces_paper (over full states);
     without recall goal_gan, gan_fit_all, uniform, feasible, oracle, alp_gmm; controls of the first:
@@ -128,12 +130,24 @@ POINT = MazeConfig(
 )
 
 
+def knows(env: str) -> bool:
+    """Whether it is an environment with this learner.
+
+    Raises:
+        OwnEnvError: for one's own that is none, or that nobody has allowed.
+    """
+    return env in envs.NAMES or envs.own.find(env) is not None
+
+
 def preset(env: str, method: str | None = None) -> MazeConfig:
     """The default settings for an environment and a method.
 
     Raises:
         UsageError: if there is no such environment or method.
     """
+    if mine := envs.own.find(env):
+        cfg = own_preset(env, mine)
+        return cfg if method is None else with_method(cfg, method)
     if env not in envs.NAMES:
         raise UsageError(f"unknown environment {env!r}: choose one of {', '.join(envs.NAMES)}")
     cfg = replace(ANT if env.startswith("ant") else POINT, env=env)
@@ -153,6 +167,22 @@ def preset(env: str, method: str | None = None) -> MazeConfig:
     return cfg if method is None else with_method(cfg, method)
 
 
+def own_preset(env: str, mine: envs.own.Own) -> MazeConfig:
+    """The default settings for an environment of one's own.
+
+    Raises:
+        UsageError: for settings in its preset that there are not.
+    """
+    settings = dict(mine.preset)
+    base = settings.pop("like", "ant_umaze")
+    if base not in envs.NAMES:
+        raise UsageError(f"the preset of {env} is like {base!r}, which is no environment of ours")
+    try:
+        return replace(with_settings(preset(base), settings), env=env)
+    except (AttributeError, TypeError) as error:
+        raise UsageError(f"the preset of {env} has settings that there are not: {error}") from None
+
+
 def with_method(cfg: MazeConfig, method: str) -> MazeConfig:
     """The same with the settings of a method.
 
@@ -161,11 +191,20 @@ def with_method(cfg: MazeConfig, method: str) -> MazeConfig:
     """
     if method not in METHODS:
         raise UsageError(f"unknown method {method!r}: choose one of {', '.join(METHODS)}")
-    for name, value in METHODS[method].items():
+    return replace(with_settings(cfg, METHODS[method]), method=method)
+
+
+def with_settings(cfg: MazeConfig, settings: Mapping[str, Any]) -> MazeConfig:
+    """The same with other values for settings by name, those of a part as `trpo.max_kl`.
+
+    Raises:
+        AttributeError, TypeError: for a setting that there is not.
+    """
+    for name, value in settings.items():
         part, dot, key = name.partition(".")
-        settings = replace(getattr(cfg, part), **{key: value}) if dot else value
-        cfg = replace(cfg, **{part: settings})
-    return replace(cfg, method=method)
+        there = replace(getattr(cfg, part), **{key: value}) if dot else value
+        cfg = replace(cfg, **{part: there})
+    return cfg
 
 
 def check(cfg: MazeConfig) -> None:

@@ -42,8 +42,8 @@ LEARNERS = (
     Learner(
         "goalgan_bt.learners.maze",
         maze_config.MazeConfig,
-        envs.NAMES,
-        envs.NAMES.__contains__,
+        (*envs.NAMES, "module:factory (one's own)"),
+        maze_config.knows,
         maze_config.preset,
         maze_config.check,
         LOOKING | maze_config.MAY_CHANGE,
@@ -81,9 +81,12 @@ def learner_of(env: str) -> Learner:
     Raises:
         UsageError: if there is no such environment.
     """
-    for learner in LEARNERS:
-        if learner.knows(env):
-            return learner
+    try:
+        for learner in LEARNERS:
+            if learner.knows(env):
+                return learner
+    except envs.own.OwnEnvError as error:
+        raise UsageError(str(error)) from error.__cause__
     names = ", ".join(name for learner in LEARNERS for name in learner.names)
     raise UsageError(f"unknown environment {env!r}: choose one of {names}")
 
@@ -108,6 +111,7 @@ def from_command_line(argv: list[str]) -> Any:
         RunError: for a folder that is no run.
         SystemExit: after `--help`.
     """
+    envs.own.allow(value_of(argv, "--env") or "")
     run = value_of(argv, "--resume")
     default: RunConfig
     if run is not None:

@@ -47,7 +47,7 @@ def consistency(env: GoalEnv, traces: Traces) -> Consistency:
     """
     n = min(traces.valid.shape[1], env.num_envs)
     ids, valid = np.arange(n), traces.valid[:, :n]
-    goals, length = traces.goals[:n], len(valid)
+    goals, length = traces.goals[:n], len(valid) if n else 0
     gap, moved = np.full((2, length, n), np.nan)
     following, steps = traces.seeds[:n], 0
     for t in range(length):
