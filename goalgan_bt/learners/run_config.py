@@ -24,6 +24,9 @@ class RunConfig:
     """Folder of runs; this run gets a folder of its own in it."""
     resume: Path | None = None
     """Go on with this run (its folder), with its settings."""
+    track: bool = False
+    """Give the metrics to Weights & Biases, too (extra `wandb`): offline, in the run folder, unless
+    WANDB_MODE says otherwise."""
     viz: Literal["browser", "none"] = "browser"
     """Where to watch: a page in the browser, in a process of its own, or nowhere. Only mazes and
     point_nd have a map to show."""

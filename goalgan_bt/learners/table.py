@@ -11,6 +11,7 @@ from goalgan_bt.learners.run_config import RunConfig
 from goalgan_bt.runs.command_line import check_ranges, parse, value_of
 from goalgan_bt.runs.errors import RunError, UsageError
 from goalgan_bt.runs.run_folder import env_of, read_settings
+from goalgan_bt.runs.tracking import require_wandb
 
 DEFAULT = "ant_umaze"
 
@@ -37,7 +38,7 @@ class Learner(NamedTuple):
     measure: str
 
 
-LOOKING = frozenset(("resume", "viz", "viz_host", "viz_port"))
+LOOKING = frozenset(("resume", "viz", "viz_host", "viz_port", "track"))
 LEARNERS = (
     Learner(
         "goalgan_bt.learners.maze",
@@ -128,6 +129,8 @@ def from_command_line(argv: list[str]) -> Any:
                 flag = "--" + name.replace("_", "-")
                 raise UsageError(f"{flag} of a run cannot change when it is resumed: drop it")
     check(cfg)
+    if cfg.track:
+        require_wandb()
     return cfg
 
 

@@ -25,6 +25,7 @@ from goalgan_bt.runs.run_folder import write_settings
 from goalgan_bt.runs.run_writer import RunWriter
 from goalgan_bt.runs.signals import Stop
 from goalgan_bt.runs.terminal import Terminal
+from goalgan_bt.runs.tracking import Tracker
 
 
 @dataclass(frozen=True)
@@ -109,10 +110,11 @@ class Session:
         self.progress = 0.0
         self.row: dict[str, float] = {}
         self._reached, self._last, self._measures = 0.0, False, False
-        self._writer = None
+        self._writer = self._tracker = None
         if folder is not None:
             self._writer = RunWriter(folder, self.iteration, events, again)
             write_settings(folder, dict(settings))
+            self._tracker = Tracker(folder, settings) if settings.get("track") else None
         self._terminal = None if title is None else Terminal(title)
         self.background = Background()
 
@@ -200,6 +202,8 @@ class Session:
             whole = {"run": self.state_dict(), **state()}
             checkpoint.save(whole, self.folder / "checkpoint.pt")
         self._writer.metrics(self.row)
+        if self._tracker is not None:
+            self._tracker.metrics(self.row)
         if self.reports:
             if self._terminal is not None:
                 self._terminal.report(self.row, self.left())
@@ -239,6 +243,8 @@ class Session:
         early = "stopped early: --resume goes on" if saved else "stopped early"
         how = "complete" if self.complete else early
         self._writer.close(how if error is None else None)
+        if self._tracker is not None:
+            self._tracker.close()
         if self.folder is not None and isinstance(error, OSError) and not self.folder.exists():
             raise RunError(f"the run folder {self.folder} has vanished: start again") from None
 
