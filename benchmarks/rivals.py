@@ -199,6 +199,30 @@ def gymnasium_robotics(
         yield from clocked(act, durations, mujoco_env(env).dt)
 
 
+def gymnasium_robotics_async(cfg: MazeConfig, durations: Iterable[float]) -> Iterator[Sample]:
+    """The same with our step and integrator in gymnasium's `AsyncVectorEnv`: a process per
+    simulation, as many as `cfg.num_threads`."""
+    one = partial(robotics_env, cfg.env.split("_")[0], True)
+    env = gymnasium.vector.AsyncVectorEnv([one] * cfg.num_threads)
+    yield from vectorised(env, 0.02, durations)
+
+
+def vectorised(
+    env: gymnasium.vector.VectorEnv[Any, Any, Any], dt: float, durations: Iterable[float]
+) -> Iterator[Sample]:
+    """Random actions in a vector of Gymnasium's, whose steps take `dt` seconds."""
+    drawn = np.random.default_rng(0).uniform(-1, 1, (100, *(env.action_space.shape or ())))
+    actions = itertools.cycle(drawn.astype(np.float32))
+    env.reset(seed=0)
+
+    def act() -> int:
+        env.step(next(actions))
+        return env.num_envs
+
+    with contextlib.closing(env):
+        yield from clocked(act, durations, dt)
+
+
 def robotics_env(body: str, our_physics: bool) -> gymnasium.Env[Any, Any]:
     """gymnasium-robotics' U-maze for `ant` or `point`."""
     with contextlib.redirect_stderr(io.StringIO()):  # it prints a notice

@@ -7,13 +7,15 @@
 Ours: `raw_batch` is `mujoco.batch.Batch.step` on the same model with random controls and nothing
 else, the physical limit. `collection` adds the policy, goals, resets and observations. `training`
 is a whole run of the default preset: learning, labels, GAN, backtracking, imitation, evaluation,
-recording; `training_ranks` is the same as so many processes of one thread each.
+recording; `training_ranks` is the same as so many processes of one thread each. `make_vec` is
+`gymnasium.make_vec`, for learners of one's own, with random actions.
 
 Others' (rivals.py), for which the extra `bench` is needed: `sb3_contrib_trpo` trains on the same
 task and physics as usual, an action per step, with 8 simulations in turn or in processes
 (`_subproc`); `_repeat` holds each action as long as we do, with 8 simulations or 32.
 `gymnasium_robotics` is its own U-maze with random actions, as shipped and with our time step and
-integrator. `envpool` is EnvPool's Ant (no maze) or PointMaze with random actions.
+integrator, and the latter in Gymnasium's `AsyncVectorEnv`, a process per thread. `envpool` is
+EnvPool's Ant (no maze) or PointMaze with random actions.
 
 After one warm-up each, every round takes one sample of everything, all environments and numbers of
 threads. The table gives medians and ranges. Factors are over the fastest row of sb3-contrib for the
@@ -39,6 +41,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import rivals
 import torch
@@ -46,6 +49,7 @@ import tyro
 from common import Sample, Unavailable, clocked, cores, cpu_seconds, machine
 
 from goalgan_bt.agent.rollout import Collector
+from goalgan_bt.gym import env_id
 from goalgan_bt.learners import maze_config
 from goalgan_bt.learners.maze import train
 from goalgan_bt.learners.maze_config import MazeConfig, make_env
@@ -108,6 +112,14 @@ def raw_batch(cfg: MazeConfig, durations: Iterable[float]) -> Iterator[Sample]:
         return 100 * env.num_envs
 
     return clocked(episode, durations, env.dt)
+
+
+def make_vec(cfg: MazeConfig, durations: Iterable[float]) -> Iterator[Sample]:
+    """The vector environment for learners of one's own: random actions."""
+    env: Any = gymnasium.make_vec(
+        env_id(cfg.env), cfg.rollout.num_envs, "vector_entry_point", threads=cfg.num_threads
+    )
+    return rivals.vectorised(env, env.sims.dt, durations)
 
 
 def collection(cfg: MazeConfig, durations: Iterable[float]) -> Iterator[Sample]:
@@ -179,6 +191,7 @@ def kinds(settings: Settings) -> dict[str, Kind]:
     sb3 = partial(sb3, num_envs=min(8, settings.num_envs or 8))
     return {
         "raw_batch": raw_batch,
+        "make_vec": make_vec,
         "collection": collection,
         "training": partial(training, total_steps=settings.train_steps),
         "training_ranks": partial(training_ranks, total_steps=settings.train_steps),
@@ -190,6 +203,7 @@ def kinds(settings: Settings) -> dict[str, Kind]:
         ),
         "gymnasium_robotics": partial(rivals.gymnasium_robotics, our_physics=False),
         "gymnasium_robotics_our_physics": partial(rivals.gymnasium_robotics, our_physics=True),
+        "gymnasium_robotics_async": rivals.gymnasium_robotics_async,
         "envpool": rivals.envpool,
     }
 
@@ -201,7 +215,7 @@ def measurements(settings: Settings) -> list[Measurement]:
         sys.exit(f"no measurement is called {', '.join(sorted(unknown))}: {', '.join(known)}")
     found = []
     for env, (name, kind) in itertools.product(settings.env, known.items()):
-        one_thread = name.startswith("gymnasium_robotics")
+        one_thread = name in ("gymnasium_robotics", "gymnasium_robotics_our_physics")
         for threads in (1,) if one_thread else settings.threads:
             if settings.only and name not in settings.only:
                 continue

@@ -34,14 +34,14 @@ class Tracker:
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
         import wandb
 
+        mode: Any = os.environ.get("WANDB_MODE", "offline")
         self._run = wandb.init(
             project="goalgan_bt",
             id=folder.name,
             dir=folder,
             config=dict(settings),
-            mode=os.environ.get("WANDB_MODE", "offline"),
             resume="allow",
-            settings=wandb.Settings(console="off", silent=True),
+            settings=wandb.Settings(mode=mode, console="off", silent=True),
         )
         self._run.define_metric("*", step_metric="steps/train")
 
