@@ -5,6 +5,7 @@ that gymnasium-robotics gave goals: an observation is a dictionary of `observati
 `achieved_goal` and `desired_goal`, and rewards can be computed anew for other goals.
 """
 
+from collections.abc import Sequence
 from numbers import Integral
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from goalgan_bt.envs import make
 from goalgan_bt.envs.goal_env import GoalEnv, Step
-from goalgan_bt.envs.maze import BoolArray, FloatArray
+from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
 from goalgan_bt.envs.mujoco_env import INTEGRATORS
 from goalgan_bt.envs.picture import Picture
 
@@ -34,6 +35,8 @@ class Rules:
         num_envs, threads: simulations and their threads.
         render_mode: one of the metadata's, or None.
         map_file, horizon, action_repeat, integrator, dim: see `goalgan_bt.envs.make`.
+        map_rows: a map's rows, top row first, in the place of its file: what is written into a
+            data set holds on other machines too.
         width, height: of pictures, pixels.
 
     Attributes:
@@ -53,6 +56,7 @@ class Rules:
         render_mode: str | None,
         *,
         map_file: Path | str | None = None,
+        map_rows: Sequence[str] | None = None,
         horizon: int | None = None,
         action_repeat: int = 1,
         integrator: str = "implicitfast",
@@ -77,11 +81,14 @@ class Rules:
         modes = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in modes:
             raise ValueError(f"render_mode is {', '.join(modes)} or None, not {render_mode!r}")
+        if map_file is not None and map_rows is not None:
+            raise ValueError("a map is given by map_file or by map_rows, not by both")
         self.sims = make(
             name,
             num_envs,
             threads=threads,
             map_file=None if map_file is None else Path(map_file),
+            maze=None if map_rows is None else Maze(tuple(map_rows)),
             horizon=horizon,
             action_repeat=action_repeat,
             integrator=integrator,
@@ -226,7 +233,8 @@ class GoalGymEnv(Rules, gymnasium.Env[Any, Any]):
     Args:
         name: of the environment, as `--env` takes it.
         render_mode: `rgb_array` (MuJoCo's renderer), `human` (its window), or None.
-        settings: map_file, horizon, action_repeat, integrator, dim, width, height: see `Rules`.
+        settings: map_file, map_rows, horizon, action_repeat, integrator, dim, width, height: see
+            `Rules`.
 
     Raises:
         ValueError: for an environment or settings that there are not.
