@@ -95,8 +95,8 @@ class Picture:
         self._renderer = self._window = None
 
     def _put(self, state: FloatArray) -> None:
-        nq = self._model.nq
-        self._data.qpos[:], self._data.qvel[:] = state[:nq], state[nq:]
+        nq, end = self._model.nq, self._model.nq + self._model.nv  # activations may follow
+        self._data.qpos[:], self._data.qvel[:] = state[:nq], state[nq:end]
         mujoco.mj_forward(self._model, self._data)
 
     def _mark(self, scene: Any, goal: FloatArray) -> None:

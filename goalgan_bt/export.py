@@ -44,7 +44,7 @@ class ExportConfig:
     minari: str | None = None
     """Id of a data set to create (extra `minari`), such as point/umaze-v0, among those on this
     machine: in MINARI_DATASETS_PATH, or where Minari keeps them."""
-    episodes: Annotated[int | None, between(1, 1_000_000)] = None
+    episodes: Annotated[int | None, between(1, 100_000)] = None
     """Episodes of the data set; 100 by default."""
     deterministic: bool = False
     """In them, act without the noise of exploration."""

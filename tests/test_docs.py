@@ -118,8 +118,18 @@ def test_every_documented_evaluation_is_made(words, folder):
 @pytest.mark.parametrize("words", [w for w in of("export") if w])
 def test_every_documented_policy_is_exported(words, folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    pytest.importorskip("onnxscript")
-    done = call("export", *filled(words, folder))
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    pytest.importorskip("minari" if "--minari" in words else "onnxscript")
+    small = ["--episodes", "4"] if "--minari" in words else []
+    done = call("export", *filled(words, folder), *small)
+    assert done.returncode == 0 and "MB)" in done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("words", [w for w in of("share") if w])
+def test_every_documented_folder_is_shared(words, folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    pytest.importorskip("huggingface_hub")
+    done = call("share", *filled(words, folder))
     assert done.returncode == 0 and "MB)" in done.stdout, done.stderr
 
 

@@ -18,6 +18,7 @@ from goalgan_bt.envs import own
 from goalgan_bt.envs.goal_env import PhysicsError
 from goalgan_bt.envs.gym_goals import gym_goals
 from goalgan_bt.envs.maze import MapError, layout
+from goalgan_bt.envs.picture import Picture
 from goalgan_bt.envs.robot_maze import RobotMaze
 from goalgan_bt.learners import maze_config
 
@@ -165,6 +166,15 @@ def test_walls_and_a_floor_hold_it():
         env.advance(np.arange(1), np.ones((1, 1)))
     x, y, z = env.read_states(np.arange(1))[0, :3]
     assert 2 < x < 5.0 and abs(y) < 1.0 and 0.15 < z < 1.5
+
+
+def test_a_state_with_activations_is_drawn():
+    env = simulations(Sledge, n=1)
+    try:
+        picture = Picture(env, 64, 48).draw(env.start_state, np.array([2.0, 0.0]))
+    except PhysicsError as error:
+        pytest.skip(str(error))
+    assert picture.shape == (48, 64, 3) and np.ptp(picture) > 50
 
 
 def robot_of(xml, **says):
