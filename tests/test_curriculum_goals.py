@@ -5,10 +5,12 @@ import runpy
 import warnings
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
 
 import goalgan_bt.gym  # noqa: F401
@@ -194,6 +196,35 @@ def test_the_example_runs_and_measures():
     agent = example["train"](1200, 0, True)
     assert agent.num_timesteps >= 1200 and agent._n_updates > 0
     assert 0 <= example["coverage"](agent) < 0.5
+
+
+@pytest.mark.parametrize("with_curriculum", [True, False])
+def test_the_example_of_ppo_in_one_file_runs_and_measures(with_curriculum):
+    example = runpy.run_path(str(Path(__file__).parents[1] / "examples/ppo_goals.py"))
+    loop = example["Loop"](0, with_curriculum)
+    seen, after, _, rewards, ended, terminated = loop.rollout()
+    assert ended.sum() >= 32 and torch.equal(rewards > 0, terminated)
+    # What was seen after an action is seen before the next, but where another episode begins.
+    moved, anew = ~ended[:-1], ended[:-1] & ~terminated[:-1]
+    assert torch.equal(after[:-1][moved], seen[1:][moved])
+    assert (after[:-1][anew][:, 4:] != seen[1:][anew][:, 4:]).any(-1).all()  # other goals
+    agent = example["train"](2 * 2048, 0, with_curriculum)
+    assert 0 <= example["coverage"](agent) < 0.5
+
+
+def test_one_file_ppo_bootstraps_where_time_is_over_and_nowhere_else():
+    example = runpy.run_path(str(Path(__file__).parents[1] / "examples/ppo_goals.py"))
+    shape = example["ROLLOUT"], example["ENVS"]
+    gamma, lam = example["GAMMA"], example["LAMBDA"]
+    agent = SimpleNamespace(value=lambda seen: seen)
+    seen, after = torch.full((*shape, 1), 0.5), torch.full((*shape, 1), 2.0)
+    ended, terminated = torch.zeros((2, *shape), dtype=torch.bool)
+    ended[0] = terminated[2] = ended[2] = True
+    gained = example["advantages"](agent, seen, after, torch.ones(shape), ended, terminated)
+    on, over = 1 + gamma * 2.0 - 0.5, 1 - 0.5
+    assert torch.allclose(gained[0], torch.tensor(on))  # cut short: what would have come counts
+    assert torch.allclose(gained[2], torch.tensor(over))
+    assert torch.allclose(gained[1], torch.tensor(on + gamma * lam * over))
 
 
 def test_the_example_of_the_documentation_runs():

@@ -24,6 +24,7 @@ SETUP = (
     "printf",
     "head=",
     "export ",
+    "uv pip",
 )  # and no command of ours
 SMALL = (
     "--iterations 1 --rollout.num-envs 8 --rollout.steps 5 --coverage.rollouts 1 --gan.steps 2 "
