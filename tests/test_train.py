@@ -89,7 +89,7 @@ def test_a_tiny_run_leaves_a_whole_run_folder(env, tmp_path):
         assert set(np.unique(frame["label"])) <= {-1, 0, 1}
         assert frame["coverage"].shape == frame["estimate"].shape == (len(frame["test_goals"]),)
         assert set(np.unique(frame["coverage"])) <= {0.0, 1.0}  # one attempt each
-        assert (coverage > 0.12) == (env == "ant_umaze")  # a novice has the tiles beneath it
+        assert (coverage > 0.1) == (env == "ant_umaze")  # a novice has the tiles beneath it
         assert frame["coverage"].mean() == pytest.approx(coverage)
         assert frame["traces"].shape[1] == len(frame["trace_goals"])
 
