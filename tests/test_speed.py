@@ -19,6 +19,7 @@ from goalgan_bt.learners.maze_config import make_env
 ROOT = Path(__file__).parents[1]
 NAMES = {
     "raw_batch",
+    "make_vec",
     "collection",
     "training",
     "sb3_contrib_trpo",
@@ -27,6 +28,7 @@ NAMES = {
     "sb3_contrib_trpo_repeat_32",
     "gymnasium_robotics",
     "gymnasium_robotics_our_physics",
+    "gymnasium_robotics_async",
 }
 
 
