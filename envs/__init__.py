@@ -77,7 +77,9 @@ def make(
         if not (isinstance(make_body, type) and issubclass(make_body, MazeEnv)):
             if map_file is not None:
                 raise mazes.MapError(f"{name} has no maze: it takes no map")
-            env = make_body(num_envs, horizon, action_repeat, threads)
+            if physics == "warp":
+                raise PhysicsError(f"{name} is no maze of ours: it has physics of its own")
+            env = own.made(name, make_body, num_envs, horizon, action_repeat, threads)
             env.name = body
             return env
     if maze is None:
@@ -86,6 +88,7 @@ def make(
         usual = HORIZON[body] if mine is None else make_body.usual_horizon
         scale = maze.longest_path / mazes.layout("umaze").longest_path
         horizon = max(usual, 100 * round(usual * scale / 100))
-    env = make_body(maze, integrator, num_envs, horizon, action_repeat, threads, physics, device)
+    settings = maze, integrator, num_envs, horizon, action_repeat, threads, physics, device
+    env = make_body(*settings) if mine is None else own.made(name, make_body, *settings)
     env.name = f"{body}_{layout if map_file is None else map_file.stem}"
     return env

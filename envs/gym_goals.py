@@ -109,12 +109,14 @@ class GymGoals(GoalEnv):
         if radius is None:
             raise PhysicsError(f"{self.name} has no distance_threshold: give a success_radius")
         self.success_radius = float(radius)
-        has_goal = hasattr(first.unwrapped, "goal")
-        self._begin = begin or (goal_as_attribute if has_goal else goal_as_option)
         self._middle, self._half = (space.low + space.high) / 2, (space.high - space.low) / 2
         self.act_dim = len(self._half)
         told = [first.reset(seed=seed)[0] for seed in range(OWN_GOALS)]
         self._own_goals = np.array([obs["desired_goal"] for obs in told], dtype=float)
+        if self._own_goals.ndim != 2:
+            raise PhysicsError(f"{self.name}: a goal must be a row of numbers")
+        has_goal = hasattr(first.unwrapped, "goal")  # some have it only after a reset
+        self._begin = begin or (goal_as_attribute if has_goal else goal_as_option)
         self.start_state = _state(told[0])
         least, most = self._own_goals.min(axis=0), self._own_goals.max(axis=0)
         margin = np.maximum(AROUND * (most - least), self.success_radius)
@@ -152,6 +154,11 @@ class GymGoals(GoalEnv):
                 success[row] = near if won is None else won
                 if success[row] or ended[row] or late[row]:
                     break
+            # One that has won may have another goal already.
+            if not (success[row] or np.allclose(obs["desired_goal"], self.goals[i], atol=1e-4)):
+                raise PhysicsError(
+                    f"{self.name} does not take the goals that it is given: say how with `begin`"
+                )
             self._states[i] = _state(obs)
         self.elapsed[ids] += self.action_repeat
         states = self.read_states(ids)
@@ -221,7 +228,7 @@ class gym_goals:
         longest = {} if horizon is None else {"max_episode_steps": horizon}
 
         def make() -> gymnasium.Env[Any, Any]:
-            settings: Any = {"disable_env_checker": True, **longest, **self._make}
+            settings: Any = {"disable_env_checker": True, **self._make, **longest}
             try:
                 return gymnasium.make(self._id, **settings)
             except Exception as error:  # of code that is not ours

@@ -11,7 +11,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 from goalgan_bt.envs.arrays import Array, put
-from goalgan_bt.envs.goal_env import GoalEnv, Ids
+from goalgan_bt.envs.goal_env import GoalEnv, Ids, PhysicsError
 from goalgan_bt.envs.maze import FloatArray, Maze
 
 
@@ -66,6 +66,8 @@ def _batch(
 ) -> tuple[Any, Any]:
     """The simulations, and their states as rows of qpos, qvel and activations."""
     if physics == "warp":
+        if model.na:
+            raise PhysicsError("mujoco-warp takes no actuators with activations here")
         from goalgan_bt.envs.warp_batch import WarpBatch
 
         warp = WarpBatch(model, num_envs, device)
@@ -112,6 +114,9 @@ INTEGRATORS = {
 }
 
 
+OURS = "goalgan_bt_"  # how the names of what is added to a model begin
+
+
 def add_walls(spec: mujoco.MjSpec, maze: Maze, height: float, collide: bool) -> None:
     """Put the maze's walls into a model as boxes from the floor up.
 
@@ -123,7 +128,7 @@ def add_walls(spec: mujoco.MjSpec, maze: Maze, height: float, collide: bool) -> 
     """
     for i, (x0, y0, x1, y1) in enumerate(maze.walls()):
         spec.worldbody.add_geom(
-            name=f"wall_{i}",
+            name=f"{OURS}wall_{i}",
             type=mujoco.mjtGeom.mjGEOM_BOX,
             pos=[(x0 + x1) / 2, (y0 + y1) / 2, height / 2],
             size=[(x1 - x0) / 2, (y1 - y0) / 2, height / 2],

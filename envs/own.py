@@ -1,8 +1,8 @@
 """Environments of one's own, beside those that are built in.
 
-A program registers them (`register_env`), or they are named by where they are, `module:factory`.
-Naming one imports its module, which is code: only the command line and `GOALGAN_BT_ENVS` (names
-with commas between them) are asked for it, never a run folder.
+A program registers them (`goalgan_bt.register_env`), or they are named by where they are,
+`module:factory`. Naming one imports its module, which is code: only the command line and
+`GOALGAN_BT_ENVS` (names with commas between them) are asked for it, never a run folder.
 """
 
 import importlib
@@ -34,7 +34,7 @@ class Own(NamedTuple):
 _registered: dict[str, Own] = {}
 
 
-def register_env(
+def register(
     name: str, make: "Callable[..., GoalEnv]", preset: Mapping[str, Any] | None = None
 ) -> None:
     """Let `name` be an environment, of this process.
@@ -45,11 +45,14 @@ def register_env(
         preset: see `Own`; by default that of `make`, if it has one.
 
     Raises:
-        OwnEnvError: for a name that is no word or taken, and for what cannot be called.
+        OwnEnvError: for a name that is no word or taken, by another class or function, too, and
+            for what cannot be called.
     """
     from goalgan_bt.envs import NAMES
 
-    if not name.isidentifier() or name in NAMES:
+    word = isinstance(name, str) and name.isidentifier()
+    before = _registered.get(name) if word else None
+    if not word or name in NAMES or (before is not None and before.make is not make):
         raise OwnEnvError(f"{name!r} cannot be an environment's name: it is taken or no word")
     _registered[name] = _own(name, make, preset)
 
@@ -77,24 +80,46 @@ def find(name: str) -> Own | None:
     return _registered.get(name)
 
 
+def made(name: str, make: Callable[..., Any], *settings: Any) -> Any:
+    """What the code of an environment of one's own makes.
+
+    Raises:
+        OwnEnvError: if it fails, or makes something else.
+    """
+    from goalgan_bt.envs.goal_env import GoalEnv, PhysicsError
+
+    try:
+        env = make(*settings)
+    except PhysicsError:
+        raise
+    except Exception as error:  # of code that is not ours
+        raise OwnEnvError(f"{name} failed with {type(error).__name__}: {error}") from error
+    if not isinstance(env, GoalEnv):
+        raise OwnEnvError(f"{name} made {type(env).__name__}, and no GoalEnv")
+    return env
+
+
 def _allowed() -> list[str]:
-    return [name for name in os.environ.get(VARIABLE, "").split(",") if name]
+    return [name.strip() for name in os.environ.get(VARIABLE, "").split(",") if name.strip()]
 
 
 def _own(name: str, make: Any, preset: Mapping[str, Any] | None) -> Own:
     if not callable(make):
         raise OwnEnvError(f"{name}: {make!r} is neither a class nor a function")
-    return Own(make, getattr(make, "preset", {}) if preset is None else preset)
+    settings = getattr(make, "preset", {}) if preset is None else preset
+    if not isinstance(settings, Mapping):
+        raise OwnEnvError(f"{name}: its preset must be a dictionary, not {settings!r}")
+    return Own(make, settings)
 
 
 def _imported(name: str) -> Any:
     module, _, factory = name.partition(":")
     try:
         there = importlib.import_module(module)
-    except Exception as error:  # of code that is not ours
+    except (Exception, SystemExit) as error:  # of code that is not ours
         kind = type(error).__name__
         raise OwnEnvError(f"{name}: importing {module!r} failed with {kind}: {error}") from error
     try:
         return getattr(there, factory)
     except AttributeError:
-        raise OwnEnvError(f"{name}: there is no {factory!r} in {there.__file__}") from None
+        raise OwnEnvError(f"{name}: there is no {factory!r} in {module}") from None

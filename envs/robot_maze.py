@@ -22,7 +22,7 @@ import numpy as np
 from goalgan_bt.envs.arrays import Array, like, namespace, put
 from goalgan_bt.envs.goal_env import Ids, PhysicsError
 from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
-from goalgan_bt.envs.mujoco_env import INTEGRATORS, MazeEnv, add_walls
+from goalgan_bt.envs.mujoco_env import INTEGRATORS, OURS, MazeEnv, add_walls
 from goalgan_bt.envs.rotations import ahead_and_left, axes_on_map, unit_on_map, uprightness
 
 
@@ -77,12 +77,19 @@ class RobotMaze(MazeEnv):
         floors = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD
         if not any(geom.type in floors for geom in spec.worldbody.geoms):
             spec.worldbody.add_geom(
-                name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[40, 40, 1]
+                name=f"{OURS}floor",
+                type=mujoco.mjtGeom.mjGEOM_PLANE,
+                size=[40, 40, 1],
+                contype=1,
+                conaffinity=1,
             )
         model = spec.compile()
         name = cls.__name__
-        if not model.njnt or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
-            raise PhysicsError(f"{name}: the first joint of its model must be a free joint")
+        free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+        if not free.any() or not free[0] or free[1:].any():
+            raise PhysicsError(
+                f"{name}: the first joint of its model must be a free joint, and none of the others"
+            )
         if not model.nu or not model.actuator_ctrllimited.all():
             raise PhysicsError(f"{name}: each of its actuators must have a ctrlrange")
         many = cls.step_seconds / model.opt.timestep
@@ -105,6 +112,13 @@ class RobotMaze(MazeEnv):
         pose[:2] = 0.0
         self.start_state = np.concatenate([pose, np.zeros(model.nv + model.na)])
         self._joints = slice(7, model.nq)
+        name = type(self).__name__
+        if not self.success_radius > 0:
+            raise PhysicsError(f"{name}: its success_radius must be above 0")
+        if not self.healthy(self.start_state[None]).all():
+            raise PhysicsError(
+                f"{name}: the pose in which it begins ends an episode: see healthy_z, upright, pose"
+            )
 
     def pose(self, model: mujoco.MjModel) -> FloatArray:
         """qpos in which episodes begin, (nq,), but for where: that of the model's first keyframe,

@@ -47,8 +47,8 @@ if TYPE_CHECKING:
     from goalgan_bt.curriculum.curriculum import GoalCurriculum
     from goalgan_bt.curriculum.gym_wrapper import CurriculumGoals
     from goalgan_bt.curriculum.settings import GanConfig, GoalsConfig
-    from goalgan_bt.envs.own import register_env
     from goalgan_bt.learners.run_config import Trained
+    from goalgan_bt.learners.table import register_env
     from goalgan_bt.learners.trained_policy import TrainedPolicy, load_policy
     from goalgan_bt.recall.backtracking import BacktrackingModel
     from goalgan_bt.recall.places import Places, Ways
@@ -96,7 +96,7 @@ _HOME = {
     "Ways": "recall.places",
     "load_policy": "learners.trained_policy",
     "recall_traces": "recall.traces",
-    "register_env": "envs.own",
+    "register_env": "learners.table",
 }
 
 

@@ -63,6 +63,7 @@ SLEDGE = """
              dynprm="0.1" gainprm="1"/>
   </actuator>
 </mujoco>"""
+BALL = '<body><freejoint/><geom size="0.1"/></body ></worldbody>'
 SITE = '<site name="here"/></body>'
 
 
@@ -177,6 +178,22 @@ def test_a_state_with_activations_is_drawn():
     assert picture.shape == (48, 64, 3) and np.ptp(picture) > 50
 
 
+@pytest.mark.parametrize(
+    ("make", "problem"),
+    [
+        (RobotMaze, "failed with NotImplementedError"),
+        (lambda *_: 1 / 0, "failed with ZeroDivisionError"),
+        (lambda *_: None, "made NoneType, and no GoalEnv"),
+        (os.getcwd, "failed with TypeError"),
+    ],
+)
+def test_code_that_fails_says_how(make, problem):
+    name = f"failing{len(problem)}_{problem.split()[-1]}"
+    goalgan_bt.register_env(name, make, {})
+    with pytest.raises(own.OwnEnvError, match=problem):
+        envs.make(name, 1)
+
+
 def robot_of(xml, **says):
     return type(
         "Odd",
@@ -191,6 +208,9 @@ def robot_of(xml, **says):
         (SLEDGE.replace("<freejoint/>", '<joint type="slide"/>'), {}, "must be a free joint"),
         (SLEDGE.replace('ctrlrange="0 4"', ""), {}, "must have a ctrlrange"),
         (SLEDGE, {"step_seconds": 0.015}, "must be a multiple of the model's"),
+        (SLEDGE.replace("</worldbody>", BALL), {}, "none of the others"),
+        (SLEDGE, {"healthy_z": (1.0, 2.0)}, "the pose in which it begins"),
+        (SLEDGE, {"success_radius": 0.0}, "must be above 0"),
     ],
 )
 def test_what_is_no_such_robot_says_why(xml, says, problem):
@@ -212,12 +232,21 @@ def test_a_registered_robot_is_an_environment(tmp_path):
     assert again.folder == trained.folder and again.steps > trained.steps
 
 
-@pytest.mark.parametrize("name", ["ant_umaze", "two words", "a:b", "../up"])
+@pytest.mark.parametrize("name", ["ant_umaze", "hopper", "four_rooms_9", "two words", "a:b", 3])
 def test_names_that_are_taken_or_no_words_are_refused(name):
-    with pytest.raises(own.OwnEnvError, match="cannot be an environment's name"):
+    with pytest.raises(UsageError, match="cannot be an environment's name"):
         goalgan_bt.register_env(name, Spider)
-    with pytest.raises(own.OwnEnvError, match="neither a class nor a function"):
+
+
+def test_a_name_means_one_thing():
+    goalgan_bt.register_env("crawler", Spider)
+    goalgan_bt.register_env("crawler", Spider, {"discount": 0.8})
+    with pytest.raises(UsageError, match="cannot be an environment's name"):
+        goalgan_bt.register_env("crawler", Sledge)
+    with pytest.raises(UsageError, match="neither a class nor a function"):
         goalgan_bt.register_env("nothing", 3)
+    with pytest.raises(UsageError, match="must be a dictionary"):
+        goalgan_bt.register_env("nothing", Spider, "ant_umaze")
 
 
 @pytest.mark.parametrize(
@@ -227,6 +256,8 @@ def test_names_that_are_taken_or_no_words_are_refused(name):
         ({"trpo.max_lk": 1}, "max_lk"),
         ({"turbo": 1}, "turbo"),
         ({"no.such": 1}, "no"),
+        ({"trpo": {"max_kl": 1}}, "say trpo.NAME"),
+        ({"method": "goal_gan"}, "cannot say method"),
     ],
 )
 def test_a_preset_of_settings_that_there_are_not_says_which(preset, problem):
@@ -287,11 +318,14 @@ def test_code_runs_where_the_command_line_names_it_and_never_because_of_a_folder
         ("broken:Walker", "importing 'broken' failed with ZeroDivisionError"),
         ("mine:Runner", "there is no 'Runner'"),
         ("mine:", "there is no ''"),
+        ("sys:nothing", "there is no 'nothing' in sys"),
+        ("leaving:Walker", "importing 'leaving' failed with SystemExit"),
     ],
 )
 def test_what_cannot_be_imported_ends_in_a_line(name, problem, tmp_path, monkeypatch):
     (tmp_path / "mine.py").write_text(CODE)
     (tmp_path / "broken.py").write_text("1 / 0")
+    (tmp_path / "leaving.py").write_text("raise SystemExit(0)")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv(own.VARIABLE, "")
     done = call("train", "--env", name)
@@ -320,6 +354,27 @@ def test_an_adapted_environment_does_what_it_does_alone():
             ids = ids[~one.terminated]
             break
     assert ids.tolist() == [0, 1]  # the goal under its feet was reached at once
+
+
+def test_gymnasium_robotics_hears_of_the_goals_that_it_is_given():
+    told = {"success_radius": 0.45, "continuing_task": False}
+    env = gym_goals("gymnasium_robotics:PointMaze_UMaze-v3", **told)(2, 20, 1, 1)
+    ids, goals = np.arange(2), env.test_goals()[[3, 8]]
+    env.reset(ids, goals)
+    step = env.step(ids, np.zeros((2, 2)))
+    for copy, goal in zip(env._copies, goals, strict=True):
+        assert copy.unwrapped.goal == pytest.approx(goal)
+    near = np.linalg.norm(step.achieved - goals, axis=1) <= 0.45
+    assert (step.rewards > 0).tolist() == near.tolist()
+
+
+def test_an_environment_that_does_not_take_goals_is_found_out():
+    told = {"success_radius": 0.45, "continuing_task": False, "begin": lambda env, *_: env.reset()}
+    env = gym_goals("gymnasium_robotics:PointMaze_UMaze-v3", **told)(1, 20, 1, 1)
+    env.reset(np.arange(1), np.array([[1.0, 1.0]]))
+    with pytest.raises(PhysicsError, match="does not take the goals"):
+        for _ in range(20):
+            env.step(np.arange(1), np.zeros((1, 2)))
 
 
 def test_time_runs_out_and_states_stay_the_environments_own():

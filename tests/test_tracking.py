@@ -67,3 +67,10 @@ def test_without_it_a_run_does_not_begin(tmp_path, monkeypatch):
     done = call("train", *words)
     assert done.returncode == 2 and "goalgan_bt[wandb]" in done.stderr
     assert not (tmp_path / "runs").exists()
+
+
+def test_what_it_refuses_is_told_in_a_line(tmp_path, monkeypatch):
+    monkeypatch.setenv("WANDB_MODE", "nonsense")
+    done = call("train", *TINY.split(), "--viz", "none", "--track", "--out", tmp_path)
+    assert done.returncode == 2 and done.stderr.startswith("error: --track: ")
+    assert done.stderr.count("\n") == 1

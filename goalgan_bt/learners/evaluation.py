@@ -44,17 +44,20 @@ def at_home(
     Raises:
         RunError: if the folder is no run of a maze, or has no checkpoint that can be read.
     """
-    cfg, env = world_of(folder, SIDE_BY_SIDE, threads)
-    policy, iteration = load_policy(env, cfg, folder)
-    tested = env.test_goals()
+    cfg, one = world_of(folder, 1)
+    tested = one.test_goals()
     n = PER_GOAL * len(tested) if episodes is None else episodes
     if deterministic:
         n = min(n, len(tested))
+    most = SIDE_BY_SIDE if one.settable else cfg.rollout.num_envs
+    side_by_side = min(n, most)
+    _, env = world_of(folder, side_by_side, threads)
+    policy, iteration = load_policy(env, cfg, folder)
     goals = tested[spread(n, len(tested))]
     noise = None if deterministic else torch.Generator().manual_seed(seed)
     done = Attempted(np.zeros(n, bool), np.zeros(n, bool), np.zeros(n))
-    for begin in range(0, n, SIDE_BY_SIDE):
-        for active, step in attempts(env, policy, goals[begin : begin + SIDE_BY_SIDE], noise):
+    for begin in range(0, n, side_by_side):
+        for active, step in attempts(env, policy, goals[begin : begin + side_by_side], noise):
             now = begin + active
             done.seconds[now] += env.dt * env.action_repeat
             done.success[now] = step.rewards > 0

@@ -3,7 +3,7 @@
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -175,6 +175,9 @@ def own_preset(env: str, mine: envs.own.Own) -> MazeConfig:
     """
     settings = dict(mine.preset)
     base = settings.pop("like", "ant_umaze")
+    for name in ("env", "method", "resume", "out"):
+        if name in settings:
+            raise UsageError(f"the preset of {env} cannot say {name}")
     if base not in envs.NAMES:
         raise UsageError(f"the preset of {env} is like {base!r}, which is no environment of ours")
     try:
@@ -202,6 +205,8 @@ def with_settings(cfg: MazeConfig, settings: Mapping[str, Any]) -> MazeConfig:
     """
     for name, value in settings.items():
         part, dot, key = name.partition(".")
+        if not dot and is_dataclass(getattr(cfg, part, None)):
+            raise TypeError(f"{part} is a part: say {part}.NAME")
         there = replace(getattr(cfg, part), **{key: value}) if dot else value
         cfg = replace(cfg, **{part: there})
     return cfg

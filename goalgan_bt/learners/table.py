@@ -1,11 +1,12 @@
 """The table of learners: which one an environment has, and how its settings come about."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from goalgan_bt import envs
+from goalgan_bt.envs.goal_env import GoalEnv
 from goalgan_bt.learners import four_rooms, locomotion, maze_config
 from goalgan_bt.learners.run_config import RunConfig
 from goalgan_bt.runs.command_line import check_ranges, parse, value_of
@@ -74,6 +75,28 @@ LEARNERS = (
         "return",
     ),
 )
+
+
+def register_env(
+    name: str, make: Callable[..., GoalEnv], preset: Mapping[str, Any] | None = None
+) -> None:
+    """Let `name` be an environment with the maze learner, in this process: commands and the page
+    know `module:factory` only.
+
+    Args:
+        name: a word of letters, digits and `_`.
+        make: see `goalgan_bt.envs.own.Own`.
+        preset: settings by name, as those of a method; by default that of `make`, if it has one.
+
+    Raises:
+        UsageError: for a name that is no word or taken, and for what cannot be called.
+    """
+    if any(learner.knows(str(name)) for learner in LEARNERS[1:]):
+        raise UsageError(f"{name!r} cannot be an environment's name: it is taken")
+    try:
+        envs.own.register(name, make, preset)
+    except envs.own.OwnEnvError as error:
+        raise UsageError(str(error)) from None
 
 
 def learner_of(env: str) -> Learner:

@@ -17,6 +17,7 @@ import tyro
 
 from goalgan_bt.envs.goal_env import PhysicsError
 from goalgan_bt.envs.maze import MapError
+from goalgan_bt.envs.own import OwnEnvError
 from goalgan_bt.runs.errors import InterruptedRun, RunError, UsageError
 from goalgan_bt.runs.ranges import faults
 from goalgan_bt.runs.signals import SIGNALS
@@ -115,7 +116,7 @@ def run_command(work: Callable[[], int | None], go_on: Callable[[], str] | None 
         return told("standard output was closed")
     except InterruptedRun as error:
         return told(str(error))
-    except (UsageError, RunError, MapError, PhysicsError) as error:
+    except (UsageError, RunError, MapError, PhysicsError, OwnEnvError) as error:
         complain(str(error))
     except OSError as error:
         full = error.errno == errno.ENOSPC

@@ -10,6 +10,7 @@ runs/<env>-<time>-s<seed>/
     ended.txt         how the run ended; absent while it goes on, or where it was killed
     lock              held by the process that trains
     events.*          TensorBoard, if it is installed (extra `tensorboard`)
+    wandb/            Weights & Biases, with --track (extra `wandb`)
 """
 
 import json

@@ -20,7 +20,7 @@ from typing import Any
 
 from goalgan_bt.runs.background import Background, group
 from goalgan_bt.runs.clock import Clock
-from goalgan_bt.runs.errors import RunError
+from goalgan_bt.runs.errors import RunError, UsageError
 from goalgan_bt.runs.run_folder import write_settings
 from goalgan_bt.runs.run_writer import RunWriter
 from goalgan_bt.runs.signals import Stop
@@ -114,7 +114,11 @@ class Session:
         if folder is not None:
             self._writer = RunWriter(folder, self.iteration, events, again)
             write_settings(folder, dict(settings))
-            self._tracker = Tracker(folder, settings) if settings.get("track") else None
+            try:
+                self._tracker = Tracker(folder, settings) if settings.get("track") else None
+            except UsageError:
+                self._writer.close(None)
+                raise
         self._terminal = None if title is None else Terminal(title)
         self.background = Background()
 

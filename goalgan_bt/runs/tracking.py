@@ -5,6 +5,7 @@ Offline unless `WANDB_MODE` says otherwise: what is written lies in the run fold
 """
 
 import os
+import re
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
@@ -29,20 +30,28 @@ class Tracker:
     Args:
         folder: the run folder, whose name is the run's.
         settings: of the run.
+
+    Raises:
+        UsageError: if it does not begin.
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
         import wandb
 
         mode: Any = os.environ.get("WANDB_MODE", "offline")
-        self._run = wandb.init(
-            project="goalgan_bt",
-            id=folder.name,
-            dir=folder,
-            config=dict(settings),
-            resume="allow",
-            settings=wandb.Settings(mode=mode, console="off", silent=True),
-        )
+        try:
+            self._run = wandb.init(
+                project=os.environ.get("WANDB_PROJECT", "goalgan_bt"),
+                id=re.sub(r"[:;,#?/']", "-", folder.name),
+                name=folder.name,
+                reinit="create_new",  # a program's own run goes on beside it
+                dir=folder,
+                config=dict(settings),
+                resume="allow",
+                settings=wandb.Settings(mode=mode, console="off", silent=True),
+            )
+        except Exception as error:  # of the settings, the account, the network
+            raise UsageError(f"--track: {str(error).splitlines()[0]}") from None
         self._run.define_metric("*", step_metric="steps/train")
 
     def metrics(self, row: Mapping[str, float]) -> None:
