@@ -31,9 +31,9 @@ class StudyConfig:
     """Run a study, or what is missing of it, and write its tables, report and picture."""
 
     study: tyro.conf.Positional[str]
-    """A TOML file, or one of those that come along: point_umaze, point_umaze_again, point_parts, ant_umaze,
-    ant_umaze_again, point_nd, ablations, four_rooms, four_rooms_ablations, locomotion_trpo,
-    locomotion_sac, locomotion_sac_again, locomotion_lengths, locomotion_forward,
+    """A TOML file, or one of those that come along: point_umaze, point_umaze_again, point_parts,
+    ant_umaze, ant_umaze_again, point_nd, ablations, four_rooms, four_rooms_ablations,
+    locomotion_trpo, locomotion_sac, locomotion_sac_again, locomotion_lengths, locomotion_forward,
     locomotion_random, locomotion_updates."""
     out: Path = Path("docs/studies")
     """Where tables and report go, in a folder with the study's name."""
