@@ -83,8 +83,9 @@ def write_graph(run: Path, path: Path) -> None:
         UsageError, RunError: saying what is wrong.
     """
     check_target(path, (".onnx",))
-    if importlib.util.find_spec("onnxscript") is None:
-        raise UsageError('onnxscript is missing: pip install "goalgan_bt[onnx]"')
+    for library in ("onnxscript", "array_api_compat"):
+        if importlib.util.find_spec(library) is None:
+            raise UsageError(f'{library} is missing: pip install "goalgan_bt[onnx]"')
     from goalgan_bt.learners import onnx_policy
 
     logging.disable(logging.WARNING)  # torch tells of what nobody has asked for
