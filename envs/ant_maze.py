@@ -16,7 +16,12 @@ import numpy as np
 from goalgan_bt.envs.arrays import Array, columns, like, namespace
 from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
 from goalgan_bt.envs.mujoco_env import INTEGRATORS, MazeEnv, add_walls
-from goalgan_bt.envs.rotations import ahead_and_left, axes_on_map, unit_on_map
+from goalgan_bt.envs.rotations import (
+    ahead_and_left,
+    axes_on_map,
+    unit_on_map,
+    with_unit_quaternion,
+)
 
 TORSO_RADIUS = 0.25  # m
 LEG_RADIUS = 0.08  # m
@@ -161,16 +166,12 @@ class AntMaze(MazeEnv):
 
     def valid(self, states: FloatArray) -> BoolArray:
         """Healthy, the torso a radius away from every wall, no knee or foot inside one."""
-        free = self.healthy(states)
-        for corner in TORSO_RADIUS * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]):
-            free &= self.maze.is_free(states[:, :2] + corner)
+        free = self.healthy(states) & self.clear(states[:, :2], TORSO_RADIUS)
         return np.asarray(free & self.maze.is_free(self._joints(states)).all(axis=1))
 
     def repair(self, states: FloatArray) -> FloatArray:
         """The torso's quaternion brought back to length 1."""
-        states = states.copy()
-        states[:, 3:7] /= np.linalg.norm(states[:, 3:7], axis=1, keepdims=True) + 1e-9
-        return states
+        return with_unit_quaternion(states)
 
     def _joints(self, states: FloatArray) -> FloatArray:
         """Where knees and feet are on the map, (n, 8, 2), metres."""

@@ -12,7 +12,7 @@ from mujoco.batch import Batch
 
 from goalgan_bt.envs.arrays import Array, put
 from goalgan_bt.envs.goal_env import GoalEnv, Ids, PhysicsError
-from goalgan_bt.envs.maze import FloatArray, Maze
+from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
 
 
 class MujocoEnv(GoalEnv):
@@ -27,9 +27,14 @@ class MujocoEnv(GoalEnv):
         physics: `mujoco`, or `warp` for mujoco-warp in single precision (extra `gpu`).
         device: of mujoco-warp: `cpu`, `cuda`, `cuda:1`, ...; `auto` is a GPU where there is one.
 
+    Attributes:
+        substeps: of the model, in each step.
+
     Raises:
         PhysicsError: if mujoco-warp, the device or what the model needs of them is missing.
     """
+
+    substeps = 1
 
     def __init__(
         self,
@@ -58,7 +63,7 @@ class MujocoEnv(GoalEnv):
 
     def advance(self, ids: Ids, actions: Array) -> None:
         self._ctrl[ids] = put(actions, self._ctrl)
-        self.batch.step(ids, nstep=self.action_repeat)
+        self.batch.step(ids, nstep=self.action_repeat * self.substeps)
 
 
 def _batch(
@@ -106,6 +111,14 @@ class MazeEnv(MujocoEnv):
 
     def test_goals(self) -> FloatArray:
         return self.maze.tiles()
+
+    def clear(self, places: FloatArray, by: float) -> BoolArray:
+        """Whether squares of half-width `by` around places, (n, 2) metres, have their corners in
+        free cells, (n,)."""
+        free = np.ones(len(places), dtype=bool)
+        for corner in by * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]):
+            free &= self.maze.is_free(places + corner)
+        return free
 
 
 INTEGRATORS = {

@@ -19,11 +19,17 @@ from typing import Any, ClassVar
 import mujoco
 import numpy as np
 
-from goalgan_bt.envs.arrays import Array, like, namespace, put
+from goalgan_bt.envs.arrays import Array, like, namespace
 from goalgan_bt.envs.goal_env import Ids, PhysicsError
 from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
 from goalgan_bt.envs.mujoco_env import INTEGRATORS, OURS, MazeEnv, add_walls
-from goalgan_bt.envs.rotations import ahead_and_left, axes_on_map, unit_on_map, uprightness
+from goalgan_bt.envs.rotations import (
+    ahead_and_left,
+    axes_on_map,
+    unit_on_map,
+    uprightness,
+    with_unit_quaternion,
+)
 
 
 class RobotMaze(MazeEnv):
@@ -104,8 +110,8 @@ class RobotMaze(MazeEnv):
         super().__init__(maze, integrator, *simulation)
         model = self.model
         self.act_dim = model.nu
-        self._substeps = round(self.step_seconds / model.opt.timestep)
-        self.dt = self._substeps * model.opt.timestep
+        self.substeps = round(self.step_seconds / model.opt.timestep)
+        self.dt = self.substeps * model.opt.timestep
         low, high = model.actuator_ctrlrange.T
         self._middle, self._half = (low + high) / 2, (high - low) / 2
         pose = self.pose(model)
@@ -130,8 +136,7 @@ class RobotMaze(MazeEnv):
         return actions * like(self._half, actions) + like(self._middle, actions)
 
     def advance(self, ids: Ids, actions: Array) -> None:
-        self._ctrl[ids] = put(self.controls(actions), self._ctrl)
-        self.batch.step(ids, nstep=self.action_repeat * self._substeps)
+        super().advance(ids, self.controls(actions))
 
     @property
     def obs_dim(self) -> int:
@@ -175,13 +180,8 @@ class RobotMaze(MazeEnv):
 
     def valid(self, states: FloatArray) -> BoolArray:
         """Healthy, and the torso away from every wall."""
-        free = self.healthy(states)
-        for corner in self.clearance * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]):
-            free &= self.maze.is_free(states[:, :2] + corner)
-        return np.asarray(free)
+        return np.asarray(self.healthy(states) & self.clear(states[:, :2], self.clearance))
 
     def repair(self, states: FloatArray) -> FloatArray:
         """The torso's quaternion brought back to length 1."""
-        states = states.copy()
-        states[:, 3:7] /= np.linalg.norm(states[:, 3:7], axis=1, keepdims=True) + 1e-9
-        return states
+        return with_unit_quaternion(states)

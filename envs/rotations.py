@@ -1,6 +1,9 @@
 """What bodies and their observations need of rotations, seen from above."""
 
+import numpy as np
+
 from goalgan_bt.envs.arrays import Array, columns, namespace
+from goalgan_bt.envs.maze import FloatArray
 
 
 def axes_on_map(quaternion: Array) -> Array:
@@ -20,6 +23,13 @@ def axes_on_map(quaternion: Array) -> Array:
 def uprightness(quaternion: Array) -> Array:
     """The cosine of the angle between the turned z axis and the upward one, (n, 4) -> (n,)."""
     return 1 - 2 * (quaternion[:, 1] ** 2 + quaternion[:, 2] ** 2)
+
+
+def with_unit_quaternion(states: FloatArray) -> FloatArray:
+    """States of free bodies, x, y, z and then a quaternion, with that brought back to length 1."""
+    states = states.copy()
+    states[:, 3:7] /= np.linalg.norm(states[:, 3:7], axis=1, keepdims=True) + 1e-9
+    return states
 
 
 def unit_on_map(vectors: Array) -> Array:

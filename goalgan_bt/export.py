@@ -11,7 +11,6 @@ if __name__ == "__main__":  # nothing to lose: it goes at once, without a word
     leave_at_once()
 
 import contextlib
-import importlib.util
 import io
 import logging
 import warnings
@@ -22,7 +21,7 @@ from typing import Annotated
 import tyro
 
 from goalgan_bt.runs.command_line import check_ranges, check_target, parse, run_command
-from goalgan_bt.runs.errors import UsageError
+from goalgan_bt.runs.errors import UsageError, require_installed
 from goalgan_bt.runs.ranges import NOT_NEGATIVE, between
 from goalgan_bt.runs.terminal import say
 
@@ -83,9 +82,7 @@ def write_graph(run: Path, path: Path) -> None:
         UsageError, RunError: saying what is wrong.
     """
     check_target(path, (".onnx",))
-    for library in ("onnxscript", "array_api_compat"):
-        if importlib.util.find_spec(library) is None:
-            raise UsageError(f'{library} is missing: pip install "goalgan_bt[onnx]"')
+    require_installed("onnx", "onnxscript", "array_api_compat")
     from goalgan_bt.learners import onnx_policy
 
     logging.disable(logging.WARNING)  # torch tells of what nobody has asked for
@@ -104,9 +101,7 @@ def write_episodes(run: Path, name: str, episodes: int, deterministic: bool, see
     Raises:
         UsageError, RunError: saying what is wrong.
     """
-    for library in ("minari", "h5py"):
-        if importlib.util.find_spec(library) is None:
-            raise UsageError(f'{library} is missing: pip install "goalgan_bt[minari]"')
+    require_installed("minari", "minari", "h5py")
     from goalgan_bt.learners import minari_dataset
 
     made = minari_dataset.record(run, name, episodes, deterministic, seed)

@@ -11,7 +11,6 @@ from goalgan_bt.runs.signals import exit_with, leave_at_once
 if __name__ == "__main__":  # nothing to lose: it goes at once, without a word
     leave_at_once()
 
-import importlib.util
 import json
 import shlex
 import shutil
@@ -22,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from goalgan_bt.runs.command_line import parse, run_command
-from goalgan_bt.runs.errors import UsageError
+from goalgan_bt.runs.errors import UsageError, require_installed
 from goalgan_bt.runs.frames import frame_paths
 from goalgan_bt.runs.metrics_csv import read_metrics
 from goalgan_bt.runs.run_folder import commits, read_meta, write_settings
@@ -68,7 +67,7 @@ def work(argv: list[str] | None) -> None:
         UsageError, RunError: saying what is wrong.
     """
     cfg = parse(ShareConfig, argv, "python -m goalgan_bt.share")
-    check_library()
+    require_installed("hub", "huggingface_hub")
     if cfg.to is not None:
         check_name(cfg.to)
     write(cfg.run, cfg.out, cfg.to)
@@ -76,16 +75,6 @@ def work(argv: list[str] | None) -> None:
     say(f"{cfg.out} ({size / 1e6:.1f} MB)")
     if cfg.to is not None:
         say(upload(cfg.out, cfg.to))
-
-
-def check_library() -> None:
-    """See that there is the hub's client.
-
-    Raises:
-        UsageError: saying how to get it.
-    """
-    if importlib.util.find_spec("huggingface_hub") is None:
-        raise UsageError('huggingface_hub is missing: pip install "goalgan_bt[hub]"')
 
 
 def check_name(name: str) -> None:
@@ -182,7 +171,7 @@ def fetch(name: str, revision: str | None = None, local_files_only: bool = False
     Raises:
         UsageError: if the extra is missing, and for what there is not or cannot be had.
     """
-    check_library()
+    require_installed("hub", "huggingface_hub")
     check_name(name)
     from huggingface_hub import snapshot_download
 
