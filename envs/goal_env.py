@@ -1,7 +1,7 @@
 """The contract between the world and the learner: many simulations of one goal-reaching task."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,6 +113,15 @@ class GoalEnv:
         """Put those simulations into those states, (n, state_dim)."""
         raise NotImplementedError
 
+    def read_simulations(self) -> NDArray[np.floating]:
+        """All that the simulations hold, (N, k): what it takes to go on bit for bit. Of those whose
+        states are not `settable`, nothing to go on with."""
+        return self.read_states(np.arange(self.num_envs))
+
+    def write_simulations(self, rows: NDArray[np.floating]) -> None:
+        """Take over what `read_simulations` gave."""
+        self.write_states(np.arange(self.num_envs), np.asarray(rows, dtype=float))
+
     def advance(self, ids: Ids, actions: Array) -> None:
         """Hold actions in [-1, 1], (n, act_dim), for `action_repeat` steps."""
         raise NotImplementedError
@@ -168,6 +177,20 @@ class GoalEnv:
         return states
 
     # What all bodies share.
+
+    def state_dict(self) -> dict[str, NDArray[Any]]:
+        """The simulations with their goals and clocks, by rows, (N, ...)."""
+        return {
+            "simulations": self.read_simulations(),
+            "goals": self.goals.copy(),
+            "elapsed": self.elapsed.copy(),
+        }
+
+    def load_state_dict(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take over what `state_dict` gave."""
+        self.write_simulations(state["simulations"])
+        self.set_goals(np.arange(self.num_envs), state["goals"])
+        self.elapsed[:] = state["elapsed"]
 
     def along(self, achieved: Array, goals: Array) -> Array:
         """Offsets from places to goals, both (n, goal_dim), along the way where there is a

@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
+from numpy.typing import NDArray
 
 from goalgan_bt.envs.arrays import Array, put
 from goalgan_bt.envs.goal_env import GoalEnv, Ids, PhysicsError
@@ -60,6 +61,12 @@ class MujocoEnv(GoalEnv):
         # A reset also clears the solver's warm start, so that a state has one future only.
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         self._row[ids] = states
+
+    def read_simulations(self) -> NDArray[np.floating]:
+        return np.array(self.batch.state)
+
+    def write_simulations(self, rows: NDArray[np.floating]) -> None:
+        self.batch.state[:] = rows
 
     def advance(self, ids: Ids, actions: Array) -> None:
         self._ctrl[ids] = put(actions, self._ctrl)

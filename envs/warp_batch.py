@@ -70,6 +70,12 @@ class WarpBatch:
         count = self._warp.get_cuda_device_count()
         return f"cuda:{int(os.environ.get('LOCAL_RANK', '0')) % count}" if count else "cpu"
 
+    @property
+    def state(self) -> "_Carried":
+        """All that one step hands to the next, (N, k) float32: `np.array(state)` copies it,
+        `state[:] = rows` writes it."""
+        return _Carried([*self._carried, self._ctrl])
+
     def bind(self, name: str) -> Tensor:
         """A field of mujoco-warp's data, (N, ...), as a tensor that shares its memory."""
         return self._warp.to_torch(getattr(self._data, name), requires_grad=False)
@@ -137,6 +143,21 @@ class _Rows:
         rows = torch.as_tensor(np.array(states, dtype=np.float32), device=self._qpos.device)
         self._qpos[ids] = rows[:, : self._qpos.shape[1]]
         self._qvel[ids] = rows[:, self._qpos.shape[1] :]
+
+
+class _Carried:
+    """Fields of a batch as rows on the host (see `WarpBatch.state`)."""
+
+    def __init__(self, fields: list[Tensor]) -> None:
+        self._fields = fields
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[np.float32]:
+        return np.concatenate([f.reshape(len(f), -1).cpu().numpy() for f in self._fields], axis=1)
+
+    def __setitem__(self, _: slice, rows: NDArray[np.floating]) -> None:
+        sizes = [field[0].numel() for field in self._fields]
+        for field, part in zip(self._fields, torch.from_numpy(rows).split(sizes, 1), strict=True):
+            field.copy_(part.reshape(field.shape))
 
 
 def _import() -> tuple[Any, Any]:

@@ -12,6 +12,7 @@ if __name__ == "__main__":  # nothing to lose: it goes at once, without a word
     leave_at_once()
 
 import json
+import os
 import shlex
 import shutil
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
@@ -165,26 +166,33 @@ def fetch(name: str, revision: str | None = None, local_files_only: bool = False
         local_files_only: take what was downloaded before, and ask nobody.
 
     Returns:
-        Its folder, for `goalgan_bt.load_policy` and all commands that take a run. It is the
-        client's cache: not to be changed.
+        Its folder, for `goalgan_bt.load_policy` and all commands that take a run, beside the
+        client's cache: a copy, since the cache is made of links, which no run may be.
 
     Raises:
         UsageError: if the extra is missing, and for what there is not or cannot be had.
     """
     require_installed("hub", "huggingface_hub")
     check_name(name)
-    from huggingface_hub import snapshot_download
+    from huggingface_hub import constants, snapshot_download
 
     try:
-        folder = snapshot_download(
-            name,
-            revision=revision,
-            local_files_only=local_files_only,
-            allow_patterns=[*FILES],
+        cached = Path(
+            snapshot_download(
+                name,
+                revision=revision,
+                local_files_only=local_files_only,
+                allow_patterns=[*FILES],
+            )
         )
     except Exception as error:  # of the client, of its HTTP library, of the network
         raise UsageError(f"cannot fetch {name} ({reason(error)})") from None
-    return Path(folder)
+    folder = Path(constants.HF_HOME) / "goalgan_bt" / name.replace("/", "--") / cached.name
+    if not folder.exists():
+        part = folder.with_name(f"{folder.name}.{os.getpid()}.part")
+        shutil.copytree(cached, part)
+        part.rename(folder)
+    return folder
 
 
 def reason(error: Exception) -> str:

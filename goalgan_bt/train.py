@@ -27,7 +27,7 @@ from goalgan_bt.learners.run_config import RunConfig, Trained
 from goalgan_bt.learners.table import from_command_line, learner_of
 from goalgan_bt.runs.command_line import run_command
 from goalgan_bt.runs.errors import UsageError
-from goalgan_bt.runs.run_folder import ended, new_run
+from goalgan_bt.runs.run_folder import ended, mend_meta, new_run
 from goalgan_bt.runs.signals import Stop
 from goalgan_bt.runs.terminal import complain, say
 from goalgan_bt.runs.torchrun import records
@@ -98,6 +98,8 @@ def run(cfg: RunConfig, module: Any, stop: Stop, begun: Begun) -> Trained:
                 at_last.callback(page.close)
             if folder is None:
                 folder = new_run(cfg.out, world.name, cfg.seed, asdict(cfg), world.maze)
+            else:
+                mend_meta(folder, world.maze)
             begun(folder)
             say(f"run folder: {folder}")
             if page is not None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import call
+from test_resume import assert_same_runs, new_folder, settings
 
 from goalgan_bt.learners import maze_config, maze_learner, table
 from goalgan_bt.learners.maze_config import make_env
@@ -123,6 +124,37 @@ def test_one_and_two_ranks_make_the_same_update(tmp_path):
     moved = (one["policy"]["net.flat"] - fresh.policy.net.flat.detach()).abs().max()
     apart = (one["policy"]["net.flat"] - two["policy"]["net.flat"]).abs()
     assert apart.max() < 0.01 * moved
+
+
+RESUME = """
+import sys
+from dataclasses import replace
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+from test_resume import After, settings
+from goalgan_bt.learners import maze
+from goalgan_bt.runs import ranks
+ranks.begin()
+cfg = settings("point_umaze", "with_traces")
+whole, stopped = map(Path, sys.argv[1:])
+maze.train(cfg, whole if ranks.rank() == 0 else None)
+maze.train(cfg, stopped if ranks.rank() == 0 else None, After(3))
+maze.train(replace(cfg, resume=stopped), stopped)
+ranks.end()
+"""
+
+
+def test_two_ranks_that_were_stopped_go_on_as_if_they_had_not_been(tmp_path):
+    script = tmp_path / "resume.py"
+    script.write_text(RESUME.format(tests=str(Path(__file__).parent)))
+    whole, stopped = (
+        new_folder(tmp_path / name, settings("point_umaze", "with_traces"))
+        for name in ("whole", "stopped")
+    )
+    process = start(whole, stopped, program=[script])
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 0, output
+    assert_same_runs(whole, stopped)
 
 
 def moves_of(places):

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from goalgan_bt.envs import maze as mazes
-from goalgan_bt.runs import checkpoint, run_folder
+from goalgan_bt.runs import checkpoint, files, run_folder
 from goalgan_bt.runs.errors import RunError
 from goalgan_bt.runs.frames import frame_paths
 from goalgan_bt.runs.metrics_csv import read_metrics
@@ -117,7 +117,7 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path):
         raise OSError("disk full")
 
     with pytest.raises(OSError, match="disk full"):
-        run_folder.write_atomically(path, fail)
+        files.write_atomically(path, fail)
     assert path.read_bytes() == b"old"
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
@@ -202,10 +202,10 @@ def test_a_lost_row_is_told(tmp_path, capsys):
     table = tmp_path / "metrics.csv"
     table.write_text(table.read_text().rsplit(",", 1)[0])  # of the third row
     RunWriter(tmp_path, iteration=3).close("stopped early")
-    assert "has no row of iteration 3" in capsys.readouterr().err
+    assert "1 have no row" in capsys.readouterr().err
     table.unlink()
     RunWriter(tmp_path, iteration=3).close("stopped early")
-    assert "has no row of iteration 3" in capsys.readouterr().err
+    assert "3 have no row" in capsys.readouterr().err
 
 
 def test_a_run_without_a_report_yet_says_so(tmp_path):

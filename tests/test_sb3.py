@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize  # noqa
 from goalgan_bt.learners import stable_baselines  # noqa: E402
 from goalgan_bt.learners.stable_baselines import RecallTraces, Seen, Trajectory  # noqa: E402
 from goalgan_bt.recall.settings import RecallConfig  # noqa: E402
+from goalgan_bt.runs import checkpoint  # noqa: E402
 
 FASTEST = np.array([0.2, 0.4], np.float32)
 AGENTS = {"SAC": SAC, "TRPO": sb3_contrib.TRPO, "PPO": PPO}
@@ -228,9 +229,9 @@ def test_damaged_files_are_refused_in_one_line(tmp_path):
     obs, *others = state["trajectories"][0]
     nan = state["model"]["state_net.flat"] * np.nan
     for bad, why in (
-        ((tmp_path / "good.pt").read_bytes()[:500], "PytorchStreamReader"),
-        (b"", "EOFError"),
-        (b"text", "pop from"),
+        ((tmp_path / "good.pt").read_bytes()[:500], "damaged or cut short"),
+        (b"", "damaged or cut short"),
+        (b"text", "damaged or cut short"),
         ({"a": np.zeros(2)}, "Weights only load failed"),
         ({"a": 1}, "KeyError 'cfg'"),
         (state | {"trajectories": []}, "of one task"),
@@ -242,7 +243,7 @@ def test_damaged_files_are_refused_in_one_line(tmp_path):
         if isinstance(bad, bytes):
             path.write_bytes(bad)
         else:
-            torch.save(bad, path)
+            checkpoint.save(bad, path)
         with pytest.raises(ValueError, match=f"cannot load .*bad.pt: .*({why})") as told:
             RecallTraces.load(path)
         assert "\n" not in str(told.value)

@@ -143,7 +143,8 @@ def test_bad_words_end_in_one_line(trained, folder, tmp_path, monkeypatch):
     run_folder.write_settings(folder, {"env": "hopper", "method": "trpo"})
     refused("no maze: nothing of it can be loaded here", folder, "--out", out)
     (folder / "config.json").write_text(settings)
-    (folder / "checkpoint.pt").write_bytes(b"broken")
+    for name in ("checkpoint.pt", "checkpoint_previous.pt"):
+        (folder / name).write_bytes(b"broken")
     refused("it is damaged", folder, "--out", out)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     refused('huggingface_hub is missing: pip install "goalgan_bt[hub]"', trained, "--out", out)

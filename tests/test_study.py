@@ -346,6 +346,7 @@ def test_locomotion_that_was_cut_off_goes_on(tmp_path):
     agent.learn(80)
     steps = {"train": 80, "label": 0, "eval": 0}
     run_state = {"iteration": 10, "steps": steps, "seconds": 1.0, "next_measurement": 0.0}
+    run_state["metrics"] = {}
     done = {"run": run_state, "return": 0.0}
     checkpoint.save(done | locomotion.state_dict(agent, None), folder / "checkpoint.pt")
     assert execute.perform(run, tmp_path) == folder

@@ -20,7 +20,7 @@ from goalgan_bt.learners import maze_learner, table
 from goalgan_bt.learners.maze import train
 from goalgan_bt.learners.maze_config import make_env
 from goalgan_bt.learners.maze_learner import MazeLearner
-from goalgan_bt.runs import run_folder
+from goalgan_bt.runs import checkpoint, run_folder
 from goalgan_bt.runs.errors import RunError
 from goalgan_bt.runs.frames import frame_paths, read_frame
 from goalgan_bt.runs.metrics_csv import read_metrics
@@ -217,20 +217,41 @@ def test_closed_standard_output_is_one_line(tmp_path):
     assert "Traceback" not in errors
 
 
-@pytest.mark.parametrize("damage", ["missing", "cut", "empty", "other sizes", "pickle"])
-def test_a_damaged_checkpoint_is_refused_in_one_line(folder, damage):
+@pytest.mark.parametrize(
+    ("damage", "why"),
+    [
+        ("missing", "start a new run"),
+        ("cut", "it is damaged or cut short"),
+        ("empty", "it is damaged or cut short"),
+        ("other sizes", "of other settings"),
+        ("pickle", "it is damaged .Weights only load failed"),
+        ("older", "it is of an older version of goalgan_bt"),
+        ("newer", "it is of format 999, and this version reads 2"),
+        ("link", "Too many levels of symbolic links"),
+        ("pipe", "is no file"),
+    ],
+)
+def test_a_damaged_checkpoint_is_refused_in_one_line(folder, damage, why):
     cfg, path = table.load(folder), folder / "checkpoint.pt"
-    if damage == "missing":
-        path.unlink()
-    elif damage == "cut":
-        path.write_bytes(path.read_bytes()[:5000])
-    elif damage == "empty":
-        path.write_bytes(b"")
-    elif damage == "pickle":
-        torch.save({"learner": print}, path)
-    else:
+    (folder / "checkpoint_previous.pt").unlink()
+    data = path.read_bytes()
+    path.unlink()
+    if damage == "other sizes":
         cfg = replace(cfg, policy=replace(cfg.policy, hidden=(5,)))
-    with pytest.raises(RunError, match=r"start a new run|cannot resume") as error:
+        path.write_bytes(data)
+    elif damage == "pickle":
+        checkpoint.save({"learner": print}, path)
+    elif damage == "older":
+        torch.save({"learner": {}}, path)
+    elif damage == "link":
+        (folder / "elsewhere").write_bytes(data)
+        path.symlink_to("elsewhere")
+    elif damage == "pipe":
+        os.mkfifo(path)
+    elif damage != "missing":
+        newer = data.replace(b"goalgan_bt 002 sha256", b"goalgan_bt 999 sha256")
+        path.write_bytes({"cut": data[:5000], "empty": b"", "newer": newer}[damage])
+    with pytest.raises(RunError, match=why) as error:
         maze_learner.load(MazeLearner(make_env(cfg, 2), cfg), folder)
     assert "\n" not in str(error.value)
 
@@ -327,19 +348,29 @@ def test_interrupted_while_it_imports_it_says_one_line(number, code):
     assert errors == "error: interrupted: nothing new was saved, give the same command again\n"
 
 
-def test_a_full_disk_is_one_line(tmp_path):
-    """/dev/full takes no byte: the run's metrics go there."""
-    with endless(tmp_path) as (process, folder):
-        process.stdout.readline()  # the table is there: who reads /dev/full reads without end
-        path = folder / "metrics.csv"
-        while process.poll() is None:  # new columns may put a real file in its place again
-            if not path.is_symlink():
-                path.unlink(missing_ok=True)
-                path.symlink_to("/dev/full")
-            time.sleep(0.01)
-        _, errors = process.communicate(timeout=60)
+@pytest.fixture
+def small_disk(tmp_path):
+    """A disk of 2 MB."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", disk]
+    if subprocess.run(mounted, capture_output=True).returncode:
+        pytest.skip("cannot mount a small disk here")
+    yield disk
+    subprocess.run(["umount", "-l", disk], check=True)
+
+
+def test_a_full_disk_is_one_line_and_the_last_checkpoint_is_whole(small_disk):
+    with endless(small_disk) as (process, folder):
+        _, errors = process.communicate(timeout=100)
     assert process.returncode == 2
     assert "the disk is full" in errors and len(errors.strip().splitlines()) == 1
+    assert f"--resume {folder}" in errors
+    saved = checkpoint.read(folder / "checkpoint.pt")["run"]["iteration"]
+    subprocess.run(["mount", "-o", "remount,size=20m", small_disk], check=True)
+    resumed = run("--resume", folder, "--iterations", saved + 1, out=small_disk)
+    assert resumed.returncode == 0, resumed.stderr
+    assert not list(folder.glob("*.part"))
 
 
 def test_help_shows_defaults_of_the_preset():

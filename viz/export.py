@@ -15,7 +15,7 @@ from rich.progress import track
 from viser.infra import StateSerializer
 
 from goalgan_bt.runs.errors import RunError
-from goalgan_bt.runs.run_folder import write_atomically
+from goalgan_bt.runs.files import write_atomically
 from goalgan_bt.viz.body import Bodies
 from goalgan_bt.viz.captions import caption, settings_rows, state
 from goalgan_bt.viz.curves import COLOURS, PLOTS, levels, series

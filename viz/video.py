@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from goalgan_bt.runs import run_folder
+from goalgan_bt.runs import files
 from goalgan_bt.runs.errors import UsageError
 
 KINDS = (".gif", ".mp4")
@@ -39,4 +39,4 @@ def save(images: Sequence[NDArray[np.uint8]], path: Path, per_second: float) -> 
     if kind == ".mp4":
         how = {"plugin": "pyav", "codec": "libx264", "fps": per_second}
     data = iio.imwrite("<bytes>", images, extension=kind, **how)
-    run_folder.write_atomically(path, lambda file: file.write(data))
+    files.write_atomically(path, lambda file: file.write(data))

@@ -6,7 +6,7 @@ same random numbers that one process alone would give them.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any, Literal
@@ -21,6 +21,7 @@ from goalgan_bt.agent.settings import RolloutConfig
 from goalgan_bt.envs.goal_env import GoalEnv, Ids
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.runs import ranks
+from goalgan_bt.runs.terminal import complain
 
 Float32 = NDArray[np.float32]
 
@@ -135,6 +136,47 @@ class Collector:
     def _table(self, dtype: type[np.generic], *row: int) -> NDArray[Any]:
         """Zeros, (T, N, *row), with the steps of one simulation side by side in memory."""
         return np.zeros((self.env.num_envs, self.cfg.steps, *row), dtype).swapaxes(0, 1)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The simulations of all ranks, however many, and their unfinished episodes. All ranks
+        must ask."""
+        rows = self.env.state_dict() | {"age": self._age, "from_start": self._from_start}
+        for name, table, used, _ in self._so_far():
+            rows[name] = table[used]
+        return {name: torch.from_numpy(ranks.gather(row)) for name, row in rows.items()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take over what `state_dict` gave, to go on bit for bit; where that cannot be, because
+        there are more simulations now, or fewer, or their states cannot be set, begin anew with
+        goals of then.
+
+        Raises:
+            ValueError: if it is of another body or other times.
+        """
+        rows = {name: row.numpy() for name, row in state.items()}
+        age, longest = rows["age"], self.env.horizon // self.env.action_repeat
+        if not self.env.settable or len(age) != self._total:
+            complain("the simulations begin anew: this is not the same run, bit for bit", "note")
+            self.begin(rows["goals"])
+            return
+        if age.min() < 0 or age.max() > longest:
+            raise ValueError("its episodes are too long")
+        for name, table in self.env.state_dict().items():
+            if rows[name].shape != (self._total, *table.shape[1:]):
+                raise ValueError(f"the {name} of its simulations are of other sizes")
+        self.env.load_state_dict({name: rows[name][self._mine] for name in self.env.state_dict()})
+        self._age[:], self._from_start[:] = age[self._mine], rows["from_start"][self._mine]
+        before = age[: self._mine.start]  # of other ranks
+        for name, table, used, more in self._so_far():
+            first = (before + more).clip(max=table.shape[1]).sum()
+            table[used] = rows[name][first : first + used.sum()]
+
+    def _so_far(self) -> Iterator[tuple[str, Float32, BoolArray, int]]:
+        """The tables of actions and states, (N, T, ...), which of their rows are those of
+        unfinished episodes, (N, T), and how many more an episode has than actions."""
+        for name, table, more in ("actions", self._actions, 0), ("states", self._states, 1):
+            used = np.arange(len(table)) < (self._age + more)[:, None]
+            yield name, table.swapaxes(0, 1), used, more
 
     def begin(self, goals: FloatArray) -> None:
         """Start every simulation anew, each with one of the goals (G, goal_dim)."""

@@ -24,8 +24,8 @@ from goalgan_bt.envs.four_rooms import SIZES, FourRooms, Ints
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.learners.run_config import RunConfig, Trained, World
 from goalgan_bt.runs.errors import UsageError
+from goalgan_bt.runs.files import write_atomically
 from goalgan_bt.runs.ranges import SHARE, between
-from goalgan_bt.runs.run_folder import write_atomically
 from goalgan_bt.runs.session import Limits, Schedule, Session
 from goalgan_bt.runs.signals import Stop
 from goalgan_bt.runs.torchrun import refuse_company

@@ -21,7 +21,7 @@ from goalgan_bt.recall.settings import RecallConfig
 from goalgan_bt.runs.errors import RunError, UsageError
 from goalgan_bt.runs.ranges import between
 from goalgan_bt.runs.run_folder import end_run
-from goalgan_bt.runs.session import Limits, Schedule, Session
+from goalgan_bt.runs.session import STATE, Limits, Schedule, Session
 from goalgan_bt.runs.signals import Stop
 from goalgan_bt.runs.torchrun import refuse_company
 
@@ -223,7 +223,8 @@ def train(cfg: LocomotionConfig, folder: Path | None, stop: Stop | None = None) 
             run.note("eval", {"return": round(mean, 2)})
             run.note("recall", {} if recall is None else recall.last)
             learned = {"return": float(mean)} | state_dict(agent, recall)
-            run.report({}, learned.copy)
+            run.report({})
+            run.save(learned)
         if run.complete and folder is not None:
             save_policy(agent, folder)
     if run.complete and folder is not None:
@@ -271,7 +272,7 @@ def resume(agent: Any, recall: Any, folder: Path) -> tuple[dict[str, Any], float
         raise RunError(f"{folder} has reached its limits: there is nothing left to do")
     with checkpoint.saved(folder) as state:
         restore(agent, recall, state)
-        run, mean = dict(state["run"]), float(state["return"])
+        run, mean = {name: state["run"][name] for name in STATE}, float(state["return"])
         counts = run["iteration"], run["seconds"], run["next_measurement"], *run["steps"].values()
         if not math.isfinite(sum(counts) + mean):
             raise ValueError("what was measured is not finite")

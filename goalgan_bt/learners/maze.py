@@ -58,9 +58,11 @@ def train(cfg: MazeConfig, folder: Path | None, stop: Stop | None = None) -> Tra
     test_env = make_env(cfg, TEST_ENVS if env.settable else env.num_envs)
     learner = MazeLearner(env, cfg)
     test_env.heading = env.heading
+    collector = collector_of(learner, env)
     covered = math.nan
-    with session(cfg, folder, learner, env, stop) as run:
-        collector = begin(learner, env, test_env, run)
+    with session(cfg, folder, learner, collector, stop) as run:
+        if run.iteration == 0:
+            begin(learner, collector, run)
         while run.goes_on():
             learner.policy.cap_std(run.progress)
 
@@ -86,6 +88,7 @@ def train(cfg: MazeConfig, folder: Path | None, stop: Stop | None = None) -> Tra
             measured = measure(learner, test_env, recalled.traces, run)
             covered = covered if measured is None else float(measured.mean())
             report(learner, env, goals, judged, batch, recalled, measured, run)
+            save(learner, collector, run)
     return Trained(folder, "coverage", covered, run.steps["train"])
 
 
@@ -158,37 +161,38 @@ def envs_per_rank(cfg: MazeConfig) -> int:
 
 
 def session(
-    cfg: MazeConfig, folder: Path | None, learner: MazeLearner, env: GoalEnv, stop: Stop | None
+    cfg: MazeConfig,
+    folder: Path | None,
+    learner: MazeLearner,
+    collector: Collector,
+    stop: Stop | None,
 ) -> Session:
-    """The run, and the learner as it was where the run goes on."""
-    state = None if cfg.resume is None or folder is None else load(learner, folder)
+    """The run, and learner and simulations as they were where the run goes on."""
+    state = None if cfg.resume is None or folder is None else load(learner, folder, collector)
     return Session(
         folder if ranks.rank() == 0 else None,
         asdict(cfg),
         Limits(cfg.total_steps, cfg.iterations, cfg.minutes),
         # Not in the first iteration: its line shall tell at once that all is well.
         Schedule(lambda steps: steps + cfg.coverage.every, 2, cfg.report_every),
-        f"{env.name}, seed {cfg.seed}",
+        f"{collector.env.name}, seed {cfg.seed}",
         state=state,
         stop=stop,
         agreed=ranks.agreed,
     )
 
 
-def begin(learner: MazeLearner, env: GoalEnv, test_env: GoalEnv, run: Session) -> Collector:
-    """The simulations at work.
-
-    Before any curriculum exists, goals anywhere tell what is out of reach, and the GAN begins with
-    wherever a fresh policy happens to wander.
-    """
-    cfg, curriculum = learner.cfg, learner.curriculum
+def collector_of(learner: MazeLearner, env: GoalEnv) -> Collector:
+    """The simulations, for practice."""
+    cfg = learner.cfg
     keep = cfg.backtracking.experience if cfg.imitation.source != "none" else "none"
-    collector = Collector(env, cfg.rollout, learner.rng, learner.noise["rollout"], keep)
-    if run.iteration > 0:
-        goals, steps = learner.propose(test_env)
-        run.count("label", steps)
-        collector.begin(goals)
-        return collector
+    return Collector(env, cfg.rollout, learner.rng, learner.noise["rollout"], keep)
+
+
+def begin(learner: MazeLearner, collector: Collector, run: Session) -> None:
+    """Before any curriculum exists, goals anywhere tell what is out of reach, and the GAN begins
+    with wherever a fresh policy happens to wander."""
+    cfg, curriculum = learner.cfg, learner.curriculum
     anywhere = curriculum.uniform(ANYWHERE)
     collector.begin(anywhere)
     rollouts, episodes = collector.collect(learner.policy, anywhere)
@@ -199,7 +203,6 @@ def begin(learner: MazeLearner, env: GoalEnv, test_env: GoalEnv, run: Session) -
     visited = collector.achieved_goals()
     curriculum.see(visited)
     curriculum.begin(visited)
-    return collector
 
 
 def batch_steps(cfg: MazeConfig) -> int:
@@ -404,7 +407,7 @@ def measure(
     learner: MazeLearner, test_env: GoalEnv, traces: Traces, run: Session
 ) -> FloatArray | None:
     """Coverage per test goal of the stochastic policy, (K,), if that is due; and the end of what
-    learns in the background, so that all ranks have the same."""
+    several ranks learn in the background, so that all have the same."""
     measured = None
     if run.measures():
         with run.clock.measure("evaluation"):
@@ -423,7 +426,7 @@ def measure(
         run.note("backtracking", checked.metrics())
     with run.clock.measure("learning"):
         run.background.wait("gan")
-        if measured is not None or ranks.size() > 1:  # else it has until the next batch
+        if ranks.size() > 1:  # else it has until the next batch
             run.background.wait("value")
         ranks.agree(learner.tensors())
     return measured
@@ -486,9 +489,17 @@ def report(
         | group("curriculum", about_goals)
         | group("places", about_places)
         | group("backtracking", about_traces),
-        state=lambda: {"learner": learner.state_dict()},
-        frame=frame,
+        frame,
     )
+
+
+def save(learner: MazeLearner, collector: Collector, run: Session) -> None:
+    """A checkpoint with each measurement and at the end. All ranks take part."""
+    if not run.saves:
+        return
+    with run.clock.measure("saving"):
+        run.background.finish()
+        run.save({"learner": learner.state_dict(), "collector": collector.state_dict()})
 
 
 def mean(values: np.ndarray) -> float:

@@ -261,7 +261,11 @@ def make_env(cfg: MazeConfig, num_envs: int, maze: Maze | None = None) -> GoalEn
         RunError: if the maze that was recorded cannot be read.
     """
     if maze is None and cfg.resume is not None:
-        maze = maze_of(cfg.resume)
+        try:
+            maze = maze_of(cfg.resume)
+        except RunError as error:
+            if cfg.map is not None:
+                raise RunError(f"{error}, and the run's maze was in it") from None
         if maze is None and cfg.map is not None:
             raise RunError(
                 f"{cfg.resume / 'meta.json'} holds no maze: the run cannot go on in its own"

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from goalgan_bt.agent.policy import GaussianPolicy, ValueFunction
-from goalgan_bt.agent.rollout import Episodes, Rollouts
+from goalgan_bt.agent.rollout import Collector, Episodes, Rollouts
 from goalgan_bt.curriculum.baselines import feasible, oracle
 from goalgan_bt.curriculum.curriculum import GoalCurriculum
 from goalgan_bt.envs.goal_env import GoalEnv
@@ -22,8 +22,8 @@ from goalgan_bt.recall.places import Places
 from goalgan_bt.recall.transitions import Transitions
 from goalgan_bt.runs import checkpoint, ranks
 from goalgan_bt.runs.errors import RunError
+from goalgan_bt.runs.session import STATE
 
-SESSION = ("iteration", "steps", "seconds", "next_measurement")  # what a `Session` needs to go on
 NOISY = ("rollout", "evaluation", "trpo", "value", "gan", "backtracking", "imitation")
 
 
@@ -165,8 +165,8 @@ class MazeLearner:
             noise.set_state(state["noise"][name])
 
 
-def load(learner: MazeLearner, folder: Path) -> dict[str, Any]:
-    """Put a run's `checkpoint.pt` into a learner of the same settings.
+def load(learner: MazeLearner, folder: Path, collector: Collector | None = None) -> dict[str, Any]:
+    """Put a run's `checkpoint.pt` into a learner of the same settings, and into its simulations.
 
     Returns:
         What the run's `Session` needs to go on.
@@ -176,7 +176,9 @@ def load(learner: MazeLearner, folder: Path) -> dict[str, Any]:
     """
     with checkpoint.saved(folder) as state:
         learner.load_state_dict(state["learner"])
-        run = {name: state["run"][name] for name in SESSION}
+        if collector is not None:
+            collector.load_state_dict(state["collector"])
+        run = {name: state["run"][name] for name in STATE}
     return run
 
 

@@ -15,7 +15,7 @@ from goalgan_bt.envs.goal_env import GoalEnv
 from goalgan_bt.learners.maze_learner import load_policy
 from goalgan_bt.learners.trained_policy import world_of
 from goalgan_bt.recall.places import AROUND, Places
-from goalgan_bt.runs import run_folder
+from goalgan_bt.runs import files
 from goalgan_bt.runs.errors import UsageError
 
 OPSET = 20
@@ -156,4 +156,4 @@ def export(folder: Path, path: Path) -> None:
     if program is None:
         raise UsageError("this version of torch makes no ONNX program")
     data = program.model_proto.SerializeToString()
-    run_folder.write_atomically(path, lambda file: file.write(data))
+    files.write_atomically(path, lambda file: file.write(data))

@@ -75,15 +75,29 @@ class Transitions:
         return new
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The rows, the oldest first."""
-        order = self.newest(self.size)
-        return {name: torch.from_numpy(getattr(self, name)[order]) for name in self.COLUMNS}
+        """The rows as they lie in the ring, whose order decides what is drawn."""
+        rows = {name: torch.from_numpy(getattr(self, name)[: self.size]) for name in self.COLUMNS}
+        counts = self.cursor, self.added, self.learned
+        return rows | {"counts": torch.tensor(counts)}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Take over what `state_dict` gave; all of it counts as learned from."""
+        """Take over what `state_dict` gave, into a ring of another size the newest rows.
+
+        Raises:
+            ValueError: if that is no ring.
+        """
+        cursor, added, learned = state["counts"].tolist()
+        rows = [state[name].numpy() for name in self.COLUMNS]
+        n = len(rows[0])
+        if not (0 <= cursor <= n and n <= added >= learned >= 0):
+            raise ValueError("the counts of its transitions do not fit")
+        capacity = len(self.states)
+        if n != capacity and cursor < n:  # the oldest first
+            rows = [np.roll(row, -cursor, axis=0) for row in rows]
         self.size = self.cursor = self.added = 0
-        self.add(*(state[name].numpy() for name in self.COLUMNS))
-        self.learned = self.added
+        self.add(*rows)
+        self.cursor = cursor % capacity if n == capacity else self.cursor
+        self.added, self.learned = added, learned
 
     @property
     def enough(self) -> bool:

@@ -30,8 +30,12 @@ class Background:
         """Call fit(*args), which gives metrics, after what was started before."""
         self._running[name] = self._thread.submit(fit, *args)
 
+    def finish(self) -> None:
+        """Until all have ended."""
+        self.wait(*self._running)
+
     def wait(self, *names: str) -> None:
         """Until these have ended, if they were started."""
-        for name in names:
+        for name in list(names):
             if name in self._running:
                 self.metrics |= group(name, self._running.pop(name).result())

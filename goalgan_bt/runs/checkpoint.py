@@ -1,15 +1,31 @@
-"""Checkpoints: the whole training state in one file, written atomically, read without pickles."""
+"""Checkpoints: the whole training state in one file, read without pickles.
 
-import io
+A file is what `torch.save` writes, so that `torch.load` reads it, and behind it, as the comment of
+that archive, its version and its checksum: torch itself checks none, and loads a file with a
+flipped bit. It is written beside the old one, which stays as `checkpoint_previous.pt`.
+"""
+
+import contextlib
+import hashlib
+import os
+import re
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import torch
 
 from goalgan_bt.runs.errors import RunError
-from goalgan_bt.runs.run_folder import write_atomically
+from goalgan_bt.runs.files import open_own, write_atomically
+from goalgan_bt.runs.terminal import complain
+
+VERSION = 2  # of what is in it; 1 had no checksum
+NAME, PREVIOUS = "checkpoint.pt", "checkpoint_previous.pt"
+SEAL = re.compile(rb"goalgan_bt (\d{3}) sha256 ([0-9a-f]{64})")
+SEALED = len(f"goalgan_bt 000 sha256 {'0' * 64}")
+CHUNK = 2**20
 
 
 def save(state: dict[str, Any], path: Path) -> None:
@@ -19,9 +35,98 @@ def save(state: dict[str, Any], path: Path) -> None:
         OSError: where that fails, as on a full disk.
     """
     try:
-        write_atomically(path, lambda file: torch.save(state, file))
+        write_atomically(path, lambda file: _write(state, file))
     except RuntimeError as error:  # of torch's archive, which hides what stopped it
         raise (error.__context__ or error) from None
+
+
+def save_run(state: dict[str, Any], folder: Path) -> None:
+    """Write a run's checkpoint and keep the one before it.
+
+    Raises:
+        OSError: where that fails; the old one is then still there.
+    """
+    path, previous = folder / NAME, folder / PREVIOUS
+    if path.exists():
+        kept = folder / f"{PREVIOUS}.part"
+        kept.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # where there are no hard links, there is no previous
+            kept.hardlink_to(path)
+            kept.replace(previous)
+    save(state, path)
+    directory = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(directory)  # or a power cut could take back the new name
+    finally:
+        os.close(directory)
+
+
+def _write(state: dict[str, Any], file: IO[bytes]) -> None:
+    writer: Any = _Hashing(file)
+    torch.save(state, writer)
+    seal = f"goalgan_bt {VERSION:03d} sha256 {writer.hash.hexdigest()}".encode()
+    file.seek(-2, os.SEEK_END)  # the length of the archive's comment, which is its last field
+    file.write(len(seal).to_bytes(2, "little") + seal)
+
+
+class _Hashing:
+    """A file that only grows, and the checksum of what it holds."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file, self.hash = file, hashlib.sha256()
+
+    def write(self, data: Any) -> int:
+        self.hash.update(data)
+        return self._file.write(data)
+
+    def flush(self) -> None:
+        self._file.flush()
+
+
+def check_seal(file: IO[bytes]) -> None:
+    """See that a file is as it was written.
+
+    Raises:
+        ValueError: if it is not, or of another version.
+    """
+    size = file.seek(0, os.SEEK_END) - SEALED
+    file.seek(max(size, 0))
+    seal = SEAL.fullmatch(file.read())
+    if seal is None:
+        file.seek(0)
+        whole = zipfile.is_zipfile(file)
+        older, damaged = "it is of an older version of goalgan_bt", "it is damaged or cut short"
+        raise ValueError(older if whole else damaged)
+    if int(seal[1]) != VERSION:
+        raise ValueError(f"it is of format {int(seal[1])}, and this version reads {VERSION}")
+    found, left = hashlib.sha256(), size - 2
+    file.seek(0)
+    while left > 0 and (chunk := file.read(min(CHUNK, left))):
+        found.update(chunk)
+        left -= len(chunk)
+    found.update(b"\0\0")  # where the comment's length stands now
+    if found.hexdigest() != seal[2].decode():
+        raise ValueError("it is damaged: its checksum is another")
+
+
+def read(path: Path) -> Any:
+    """What `save` wrote.
+
+    Raises:
+        OSError: if the file cannot be opened.
+        ValueError: if it is damaged or of another version.
+    """
+    with open_own(path) as file:
+        check_seal(file)
+        file.seek(0)
+        with zipfile.ZipFile(file) as archive:  # ours are not compressed: no more than the file
+            if sum(part.file_size for part in archive.infolist()) > os.fstat(file.fileno()).st_size:
+                raise ValueError("it is no checkpoint: what it holds is larger than itself")
+        file.seek(0)
+        try:
+            return torch.load(file, weights_only=True)
+        except Exception as error:  # torch raises many kinds
+            raise ValueError(f"it is damaged ({reason(error)})") from None
 
 
 def restore(module: Any, state: dict[str, Any]) -> None:
@@ -41,27 +146,50 @@ def loaded(path: Path) -> Iterator[Any]:
         OSError: if the file cannot be opened.
         ValueError: for whatever goes wrong while it is read and taken over.
     """
-    data = path.read_bytes()
     try:
-        yield torch.load(io.BytesIO(data), weights_only=True)
-    except Exception as error:  # torch raises many kinds for a damaged file
-        why = f"it is damaged or of other settings or another version ({reason(error)})"
-        raise ValueError(f"cannot load {path}: {why}") from error
+        state = read(path)
+    except ValueError as error:
+        raise ValueError(f"cannot load {path}: {error}") from None
+    try:
+        yield state
+    except Exception as error:  # of whatever it is put into
+        raise ValueError(f"cannot load {path}: {OTHER} ({reason(error)})") from error
+
+
+OTHER = "it is damaged or of other settings or another version"
 
 
 @contextmanager
 def saved(folder: Path) -> Iterator[dict[str, Any]]:
-    """What `save` wrote; whatever goes wrong while it is read and taken over is a `RunError`."""
-    path = folder / "checkpoint.pt"
-    if not path.is_file():
-        raise RunError(f"{folder} has no checkpoint.pt to resume from: start a new run")
+    """A run's checkpoint, while it is taken over; the one before where the last is damaged, which
+    is then told.
+
+    Raises:
+        RunError: for whatever goes wrong while it is read and taken over.
+    """
+    path, previous = folder / NAME, folder / PREVIOUS
     try:
-        yield torch.load(path, weights_only=True)
-    except Exception as error:  # torch raises many kinds for a damaged file
-        raise RunError(
-            f"cannot resume from {path}: it is damaged or of other settings or another version "
-            f"({reason(error)})"
-        ) from None
+        state = read(path)
+    except (OSError, ValueError) as error:
+        missing = not os.path.lexists(path)
+        if not previous.is_file():
+            if missing:
+                raise RunError(
+                    f"{folder} has no checkpoint.pt to resume from: start a new run"
+                ) from None
+            raise RunError(f"cannot resume from {path}: {error}") from None
+        try:
+            state = read(previous)
+        except (OSError, ValueError) as other:
+            raise RunError(
+                f"cannot resume from {path}: {error}; nor from {previous.name}: {other}"
+            ) from None
+        why = "there is none" if missing else error
+        complain(f"{path}: {why}; the one before it is used, {previous.name}", "warning")
+    try:
+        yield state
+    except Exception as error:  # of whatever it is put into
+        raise RunError(f"cannot resume from {path}: {OTHER} ({reason(error)})") from None
 
 
 def reason(error: Exception) -> str:

@@ -1,16 +1,22 @@
 """Frames: what a report shows, as arrays, a file each."""
 
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from goalgan_bt.runs.errors import RunError
+from goalgan_bt.runs.files import LARGE, open_own
+
+NUMBER = re.compile(r"[0-9]{1,18}")
 
 
 def frame_paths(folder: Path) -> list[Path]:
-    """The frames of a run, oldest first."""
-    return sorted(f for f in (folder / "frames").glob("*.npz") if f.stem.isdecimal())
+    """The frames of a run, oldest first; none where their folder is a link."""
+    if (folder / "frames").is_symlink():
+        return []
+    return sorted(f for f in (folder / "frames").glob("*.npz") if NUMBER.fullmatch(f.stem))
 
 
 def read_frame(path: Path) -> dict[str, np.ndarray[Any, Any]]:
@@ -20,7 +26,9 @@ def read_frame(path: Path) -> dict[str, np.ndarray[Any, Any]]:
         RunError: if it cannot be read.
     """
     try:
-        with np.load(path, allow_pickle=False) as data:
+        with open_own(path) as file, np.load(file, allow_pickle=False) as data:
+            if sum(part.file_size for part in data.zip.infolist()) > LARGE:
+                raise ValueError("what it holds is too large for a frame")
             arrays = {name: np.asarray(data[name]) for name in data.files}
     except Exception as error:  # a damaged archive raises many kinds
         raise RunError(f"cannot read the frame {path}: {error}") from None

@@ -7,6 +7,7 @@ import csv
 import io
 import math
 import os
+import re
 from array import array
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -16,7 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from goalgan_bt.runs.errors import RunError
-from goalgan_bt.runs.run_folder import write_atomically
+from goalgan_bt.runs.files import LARGE, open_own, read_own, write_atomically
+
+COUNT = re.compile(r"[0-9]{1,18},[0-9]{1,18}$")
 
 
 def write_table(path: Path, columns: Sequence[str], rows: list[dict[str, str]]) -> None:
@@ -41,7 +44,7 @@ def read_metrics(folder: Path) -> tuple[list[str], list[dict[str, str]]]:
     """
     path = folder / "metrics.csv"
     try:
-        text = path.read_bytes().decode()
+        text = read_own(path).decode()
     except FileNotFoundError:
         if (folder / "meta.json").exists():
             raise RunError(
@@ -61,6 +64,22 @@ def read_metrics(folder: Path) -> tuple[list[str], list[dict[str, str]]]:
             f"{path} is damaged: each row needs an iteration, steps/train and a cell per column"
         )
     return columns, rows
+
+
+def sound_rows(folder: Path) -> tuple[list[str], list[dict[str, str]], int]:
+    """Columns and rows of a run's `metrics.csv` as far as they are sound, none where there is no
+    such table, and how many are not."""
+    try:
+        text = read_own(folder / "metrics.csv").decode(errors="replace")
+    except OSError:
+        return [], [], 0
+    columns, *lines = list(_cells(text)) or [[]]
+    if not {"iteration", "steps/train"} <= {*columns} or len({*columns}) < len(columns):
+        return [], [], len(lines)
+    whole = [dict(zip(columns, line, strict=True)) for line in lines if len(line) == len(columns)]
+    counted = [row for row in whole if COUNT.match(row["iteration"] + "," + row["steps/train"])]
+    rows = {int(row["iteration"]): row for row in counted}
+    return columns, [rows[i] for i in sorted(rows)], len(lines) - len(rows)
 
 
 class Metrics:
@@ -91,7 +110,7 @@ class Metrics:
     def refresh(self) -> bool:
         """Read what is new; whether the file has changed."""
         try:
-            with self._path.open("rb") as file:
+            with open_own(self._path) as file:
                 status = os.fstat(file.fileno())
                 stamp = status.st_ino, status.st_size, status.st_mtime_ns
                 if stamp == self._stamp:
@@ -103,7 +122,7 @@ class Metrics:
                     self._header = header
                 self._stamp, self.changed = stamp, status.st_mtime
                 file.seek(self._read)
-                new = file.read()
+                new = file.read(LARGE)
         except OSError:  # none yet, or just being replaced
             return False
         whole = new[: new.rfind(b"\n") + 1]

@@ -28,10 +28,13 @@ from typing import Any, TypeVar
 
 from goalgan_bt.envs.maze import Maze
 from goalgan_bt.runs.errors import RunError
+from goalgan_bt.runs.files import new_file, read_own, write_atomically
+from goalgan_bt.runs.terminal import complain
 
 T = TypeVar("T")
 
 ENDED = "ended.txt"
+SMALL = 2**20  # bytes: no settings of ours are larger
 PACKAGES = ("goalgan_bt", "mujoco", "numpy", "torch", "gymnasium", "gymnasium-robotics", "tyro")
 
 
@@ -100,7 +103,8 @@ def write_meta(folder: Path, maze: Maze | None) -> None:
         "versions": versions,
         "maze": None if maze is None else {"rows": maze.rows, "cell_size": maze.cell_size},
     }
-    (folder / "meta.json").write_text(json.dumps(meta, indent=2) + "\n")
+    text = json.dumps(meta, indent=2) + "\n"
+    write_atomically(folder / "meta.json", lambda file: file.write(text.encode()))
 
 
 def _call() -> dict[str, Any]:
@@ -113,6 +117,17 @@ def note_resumed(folder: Path) -> None:
     meta["resumed"] = [*meta.get("resumed", []), _call()]
     text = json.dumps(meta, indent=2) + "\n"
     write_atomically(folder / "meta.json", lambda file: file.write(text.encode()))
+
+
+def mend_meta(folder: Path, maze: Maze | None) -> None:
+    """Write a `meta.json` that cannot be read anew; it stays as `meta_damaged.json`."""
+    try:
+        read_meta(folder)
+    except RunError as error:
+        complain(f"{error}: it is written anew", "warning")
+        if (folder / "meta.json").exists():
+            (folder / "meta.json").replace(folder / "meta_damaged.json")
+        write_meta(folder, maze)
 
 
 def commits(folder: Path) -> str:
@@ -136,11 +151,20 @@ def read_settings(kind: type[T], folder: Path) -> T:
     """
     path = folder / "config.json"
     try:
-        return _build(kind, json.loads(path.read_text()))
+        return _build(kind, json.loads(read_own(path, SMALL)))
     except FileNotFoundError:
         raise RunError(f"{folder} is no run: it has no config.json") from None
     except (OSError, ValueError, TypeError) as error:
         raise RunError(f"cannot read {path}: {error}") from None
+
+
+def settings_of(folder: Path) -> dict[str, Any]:
+    """The settings in `config.json` as nested dictionaries; none where it cannot be read."""
+    try:
+        settings = json.loads(read_own(folder / "config.json", SMALL))
+        return settings if isinstance(settings, dict) else {}
+    except (OSError, ValueError, RecursionError):
+        return {}
 
 
 def _build(kind: type[T], values: Any) -> T:
@@ -171,13 +195,14 @@ def _convert(hint: Any, value: Any) -> Any:
 
 def end_run(folder: Path, how: str) -> None:
     """Say how a run ended."""
-    (folder / ENDED).write_text(how + "\n")
+    with new_file(folder / ENDED) as file:
+        file.write((how + "\n").encode())
 
 
 def ended(folder: Path) -> str | None:
     """How a run ended; None while it goes on, or where it was killed without a word."""
     try:
-        return (folder / ENDED).read_text()[:200].strip()
+        return read_own(folder / ENDED, SMALL).decode()[:200].strip()
     except (OSError, UnicodeDecodeError):
         return None
 
@@ -185,24 +210,7 @@ def ended(folder: Path) -> str | None:
 def env_of(folder: Path) -> str:
     """The environment of a run; none, "", where that cannot be read: who reads all of its settings
     tells why."""
-    try:
-        return str(json.loads((folder / "config.json").read_text())["env"])
-    except (OSError, ValueError, TypeError, KeyError):
-        return ""
-
-
-def write_atomically(path: Path, write: Any) -> None:
-    """Call `write(binary file)` on a temporary file that then takes `path`'s place."""
-    temporary = path.with_name(path.name + ".part")
-    try:
-        with temporary.open("wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    return str(settings_of(folder).get("env", ""))
 
 
 def read_meta(folder: Path) -> dict[str, Any]:
@@ -212,7 +220,7 @@ def read_meta(folder: Path) -> dict[str, Any]:
         RunError: if the folder has none or it cannot be read.
     """
     try:
-        meta: dict[str, Any] = json.loads((folder / "meta.json").read_text())
+        meta: dict[str, Any] = json.loads(read_own(folder / "meta.json", SMALL))
     except FileNotFoundError:
         raise RunError(f"{folder} is no run: it has no meta.json") from None
     except (OSError, ValueError) as error:

@@ -2,15 +2,17 @@
 
 import csv
 import fcntl
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from goalgan_bt.runs.errors import RunError
+from goalgan_bt.runs.files import check_own, write_atomically
 from goalgan_bt.runs.frames import frame_paths
-from goalgan_bt.runs.metrics_csv import read_metrics, write_table
-from goalgan_bt.runs.run_folder import ENDED, end_run, note_resumed, write_atomically
+from goalgan_bt.runs.metrics_csv import sound_rows, write_table
+from goalgan_bt.runs.run_folder import ENDED, end_run, note_resumed
 from goalgan_bt.runs.terminal import complain
 
 
@@ -24,13 +26,14 @@ class RunWriter:
         resumed: whether the run goes on, or begins again, which `meta.json` then tells.
 
     Raises:
-        RunError: if another process trains this run, or what it holds is damaged.
+        RunError: if another process trains this run, or it holds links, which lead elsewhere.
     """
 
     def __init__(
         self, folder: Path, iteration: int = 0, events: bool = True, resumed: bool = False
     ) -> None:
         self.folder = folder
+        check_own(folder)
         self._lock = (folder / "lock").open("w")
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -46,26 +49,41 @@ class RunWriter:
     def _take_up(self, iteration: int, events: bool, resumed: bool) -> None:
         """Keep what the folder holds up to an iteration."""
         folder = self.folder
-        self._rows: list[dict[str, str]] = []
-        self._columns: list[str] = []
+        self._columns, rows, lost = sound_rows(folder)
+        self._rows = [row for row in rows if int(row["iteration"]) <= iteration]
         if resumed:
             note_resumed(folder)
         (folder / "frames").mkdir(exist_ok=True)
         (folder / ENDED).unlink(missing_ok=True)
-        if (folder / "metrics.csv").exists():
-            self._columns, rows = read_metrics(folder)
-            self._rows = [row for row in rows if int(row["iteration"]) <= iteration]
+        for left in (*folder.glob("*.part"), *(folder / "frames").glob("*.part")):
+            left.unlink()  # of a process that was killed while it wrote
+        if self._columns:
             self._rewrite()
-        if iteration and not (self._rows and int(self._rows[-1]["iteration"]) == iteration):
-            complain(
-                f"{folder / 'metrics.csv'} has no row of iteration {iteration}, whose checkpoint "
-                "it goes on from: the curves will have a gap"
-            )
+        if iteration:
+            self._tell_gaps(iteration, {int(row["iteration"]) for row in rows}, lost)
         for frame in frame_paths(folder):
             if int(frame.stem) > iteration:
                 frame.unlink()
         known = int(self._rows[-1]["steps/train"]) if self._rows else 0
         self._events = _tensorboard(folder, known) if events else None
+
+    def _tell_gaps(self, iteration: int, known: set[int], lost: int) -> None:
+        """Say what is not as the checkpoint of an iteration has it."""
+        table = self.folder / "metrics.csv"
+        ahead = sum(1 for i in known if i > iteration)
+        if ahead:
+            complain(
+                f"it goes on from the checkpoint of iteration {iteration}: the {ahead} after it "
+                "are made again",
+                "note",
+            )
+        gaps = iteration - len(known) + ahead
+        if gaps or lost:
+            complain(
+                f"{table} is damaged: of the {iteration} iterations up to the checkpoint "
+                f"{gaps} have no row, so that the curves will have a gap",
+                "warning",
+            )
 
     def metrics(self, row: dict[str, float]) -> None:
         """Append a row; a value that is missing or NaN is an empty cell."""
@@ -78,7 +96,8 @@ class RunWriter:
             self._rewrite()
         else:
             with (self.folder / "metrics.csv").open("a", newline="") as file:
-                csv.DictWriter(file, self._columns, restval="").writerow(cells)
+                writer = csv.DictWriter(file, self._columns, restval="", lineterminator="\n")
+                writer.writerow(cells)
         if self._events is not None:
             for name, value in row.items():
                 if cells[name] and name != "iteration":
@@ -107,6 +126,11 @@ class RunWriter:
         self._lock.close()
         if self._events is not None:
             self._events.close()
+
+    def sync(self) -> None:
+        """Let what was written so far outlast a power cut."""
+        with (self.folder / "metrics.csv").open("rb") as file:
+            os.fsync(file.fileno())
 
     def _rewrite(self) -> None:
         write_table(self.folder / "metrics.csv", self._columns, self._rows)

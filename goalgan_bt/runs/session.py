@@ -8,11 +8,14 @@ Whatever learns, its loop is
             if run.measures():
                 ...
             run.report(metrics, ...)
+            if run.saves:
+                run.save(state)
 """
 
+import json
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -21,11 +24,18 @@ from typing import Any
 from goalgan_bt.runs.background import Background, group
 from goalgan_bt.runs.clock import Clock
 from goalgan_bt.runs.errors import RunError, UsageError
-from goalgan_bt.runs.run_folder import write_settings
+from goalgan_bt.runs.run_folder import settings_of, write_settings
 from goalgan_bt.runs.run_writer import RunWriter
 from goalgan_bt.runs.signals import Stop
-from goalgan_bt.runs.terminal import Terminal
+from goalgan_bt.runs.terminal import Terminal, complain
 from goalgan_bt.runs.tracking import Tracker
+
+# What a run needs to go on, besides what it has learned (`Session.state_dict`).
+STATE = "iteration", "steps", "seconds", "next_measurement", "metrics"
+# Settings on which no result depends.
+HARMLESS = frozenset(
+    ("resume", "viz", "viz_host", "viz_port", "track", "out", "threads", "report_every")
+)
 
 
 @dataclass(frozen=True)
@@ -97,7 +107,9 @@ class Session:
         self.iteration, self._next = 0, 0.0
         self.steps = {"train": 0, "label": 0, "eval": 0}
         seconds = 0.0
+        self.background = Background()
         if state is not None:
+            self.background.metrics |= state["metrics"]
             self.iteration, self._next = int(state["iteration"]), float(state["next_measurement"])
             self.steps = {name: int(state["steps"][name]) for name in self.steps}
             seconds = float(state["seconds"])
@@ -112,15 +124,21 @@ class Session:
         self._reached, self._last, self._measures = 0.0, False, False
         self._writer = self._tracker = None
         if folder is not None:
+            changes = [] if state is None else changed(folder, settings)
             self._writer = RunWriter(folder, self.iteration, events, again)
             write_settings(folder, dict(settings))
+            if changes:
+                complain(
+                    f"{', '.join(changes)}: what follows is no longer, bit for bit, the run that "
+                    "began so",
+                    "note",
+                )
             try:
                 self._tracker = Tracker(folder, settings) if settings.get("track") else None
             except UsageError:
                 self._writer.close(None)
                 raise
         self._terminal = None if title is None else Terminal(title)
-        self.background = Background()
 
     @property
     def records(self) -> bool:
@@ -146,13 +164,14 @@ class Session:
 
     def measures(self) -> bool:
         """Whether this iteration measures what the policy is worth: where that is due, and at the
-        end. To be asked once, when everything else of the iteration is done."""
+        end. To be asked once, when everything else of the iteration is done. A run that is stopped
+        measures no more than it would without: it can then go on as if it had not been."""
         self._reached = self._agreed(self._done())
         stopped = self._agreed(float(self._stop is not None and self._stop.requested)) > 0
         self._last = self._reached >= 1 or stopped
         steps = self.steps["train"]
         due = self.iteration >= self._schedule.first and steps >= self._next
-        self._measures = due or self._last
+        self._measures = due or self.complete
         if self._measures:
             self._next = self._schedule.next_measurement(steps)
         return self._measures
@@ -161,6 +180,11 @@ class Session:
     def complete(self) -> bool:
         """Whether the run has reached the first of its limits."""
         return self._reached >= 1
+
+    @property
+    def saves(self) -> bool:
+        """Whether the state is saved after this iteration."""
+        return self._measures or self._last
 
     @property
     def reports(self) -> bool:
@@ -174,19 +198,18 @@ class Session:
             "steps": dict(self.steps),
             "seconds": self.clock.total(),
             "next_measurement": self._next,
+            "metrics": {name: float(value) for name, value in self.background.metrics.items()},
         }
 
     def report(
         self,
         metrics: Mapping[str, float],
-        state: Callable[[], Mapping[str, Any]] | None = None,
         frame: Callable[[], Mapping[str, Any]] | None = None,
     ) -> None:
         """Write and show what an iteration gave.
 
         Args:
             metrics: of the iteration, besides those that were noted.
-            state: gives all that was learned, which is saved with each measurement.
             frame: gives the arrays of a picture (see `RunWriter.frame`).
         """
         if self._writer is None or self.folder is None:
@@ -200,11 +223,6 @@ class Session:
             | {"memory/resident": resident_mib()}
             | dict(metrics)
         )
-        if self._measures and state is not None:
-            from goalgan_bt.runs import checkpoint  # torch, which not every learner needs
-
-            whole = {"run": self.state_dict(), **state()}
-            checkpoint.save(whole, self.folder / "checkpoint.pt")
         self._writer.metrics(self.row)
         if self._tracker is not None:
             self._tracker.metrics(self.row)
@@ -213,6 +231,15 @@ class Session:
                 self._terminal.report(self.row, self.left())
             if frame is not None:
                 self._writer.frame(self.iteration, **frame())
+
+    def save(self, state: Mapping[str, Any]) -> None:
+        """Write a checkpoint. After the report, so that all that it goes on from is there."""
+        if self._writer is None or self.folder is None:
+            return
+        from goalgan_bt.runs import checkpoint  # torch, which not every learner needs
+
+        self._writer.sync()
+        checkpoint.save_run({"run": self.state_dict(), **state}, self.folder)
 
     def left(self) -> float:
         """Seconds that the run will still take; infinite where nothing tells."""
@@ -243,7 +270,7 @@ class Session:
             self._terminal.close()
         if self._writer is None:
             return
-        saved = self.folder is not None and (self.folder / "checkpoint.pt").exists()
+        saved = self.folder is not None and (self.folder / "checkpoint.pt").is_file()
         early = "stopped early: --resume goes on" if saved else "stopped early"
         how = "complete" if self.complete else early
         self._writer.close(how if error is None else None)
@@ -251,6 +278,28 @@ class Session:
             self._tracker.close()
         if self.folder is not None and isinstance(error, OSError) and not self.folder.exists():
             raise RunError(f"the run folder {self.folder} has vanished: start again") from None
+
+
+def changed(folder: Path, settings: Mapping[str, Any]) -> list[str]:
+    """What a run that goes on does otherwise than before, of all that its results depend on."""
+
+    def flat(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+        for name, value in values.items():
+            if isinstance(value, Mapping):
+                yield from flat(value, f"{before}{name}.")
+            elif before + name not in HARMLESS:
+                yield before + name, value
+
+    old = dict(flat(settings_of(folder)))
+    new = dict(flat(json.loads(json.dumps(settings, default=str))))
+    flags = {name: "--" + name.replace("_", "-") for name in new}
+    changes = [
+        f"{flags[name]} was {old[name]} and is {new[name]}"
+        for name in new
+        if name in old and old[name] != new[name]
+    ]
+    clock = [f"{flags['minutes']} goes by the clock"] if new.get("minutes") else []
+    return changes + clock
 
 
 def resident_mib() -> float:

@@ -87,13 +87,13 @@ def say(text: str) -> None:
     print(text, flush=True)
 
 
-def complain(text: str) -> None:
+def complain(text: str, kind: str = "error") -> None:
     """One line on standard error, if anybody listens there. Of several processes on a machine that
     torchrun started, the first speaks."""
     if not speaks() and not text.startswith("rank "):
         return
     with contextlib.suppress(OSError):
-        print(f"error: {text}", file=sys.stderr, flush=True)
+        print(f"{kind}: {text}", file=sys.stderr, flush=True)
 
 
 def _duration(seconds: float) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from goalgan_bt.runs import run_folder
+from goalgan_bt.runs import files
 from goalgan_bt.runs.errors import UsageError
 from goalgan_bt.runs.metrics_csv import write_table
 from goalgan_bt.study.plan import Study, Trial, grid, settings
@@ -104,7 +104,7 @@ def report(study: Study, tables: Tables) -> None:
     (tables.folder / "README.md").write_text("\n".join(text))
     picture = io.BytesIO()
     draw(study._replace(envs=envs), runs).savefig(picture, dpi=130)
-    run_folder.write_atomically(
+    files.write_atomically(
         tables.folder / "curves.png", lambda file: file.write(picture.getvalue())
     )
 
