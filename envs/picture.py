@@ -1,6 +1,7 @@
 """A simulation as MuJoCo draws it: the body, the walls, start and goal."""
 
 import time
+import warnings
 from typing import Any
 
 import mujoco
@@ -70,8 +71,13 @@ class Picture:
         """
         self._put(state)
         if self._window is None:
+            import glfw
             from mujoco import viewer
 
+            with warnings.catch_warnings(action="ignore"):
+                screen = glfw.init()  # where there is none, the viewer would end this process
+            if not screen:
+                raise PhysicsError("a window needs a screen: use rgb_array instead")
             try:
                 self._window = viewer.launch_passive(self._model, self._data)
             except Exception as error:

@@ -9,9 +9,13 @@ The callbacks themselves are in `goalgan_bt.learners`: `curriculum_callback`, `s
 
 from goalgan_bt.curriculum.gym_wrapper import CurriculumGoals
 from goalgan_bt.envs.gym_goals import goal_as_attribute, goal_as_option
-from goalgan_bt.learners.curriculum_callback import GoalGANCallback
-from goalgan_bt.learners.stable_baselines import RecallTraces
 from goalgan_bt.recall.settings import RecallConfig
+
+try:
+    from goalgan_bt.learners.curriculum_callback import GoalGANCallback
+    from goalgan_bt.learners.stable_baselines import RecallTraces
+except ImportError as error:
+    raise ImportError('goalgan_bt.sb3 needs its extra: pip install "goalgan_bt[sb3]"') from error
 
 __all__ = [
     "CurriculumGoals",

@@ -198,7 +198,7 @@ def fetch(name: str, revision: str | None = None, local_files_only: bool = False
 def reason(error: Exception) -> str:
     """What the hub's client says, without its advice: the first line that is one."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return (lines or [type(error).__name__])[0].rstrip(".:")[:200]
+    return (lines or [type(error).__name__])[0].rstrip(".:")
 
 
 # Nothing of the machine is told: a command line may hold paths, and one from Python anything.
@@ -282,6 +282,7 @@ def card(
 
     measured, steps = measurements(run, iteration)
     title = f"{cfg.env}, seed {cfg.seed}"
+    source = '"FOLDER"' if name is None else f'goalgan_bt.share.fetch("{name}")  # or its folder'
     results = [
         EvalResult(
             task_type="reinforcement-learning",
@@ -337,7 +338,7 @@ Commit {commits(run)}; {versions}.
 import goalgan_bt
 import goalgan_bt.share
 
-folder = goalgan_bt.share.fetch("{name or "user/name"}")  # or where this folder is
+folder = {source}
 policy = goalgan_bt.load_policy(folder)
 action = policy.act(observation, goal)  # the state of the body, and where it shall go, metres
 ```

@@ -14,8 +14,13 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from syllabus.core import Curriculum, TaskWrapper
-from syllabus.task_space import BoxTaskSpace, TaskSpace
+
+try:
+    from syllabus.core import Curriculum, TaskWrapper
+    from syllabus.task_space import BoxTaskSpace, TaskSpace
+except ImportError as error:
+    wanted = 'goalgan_bt.syllabus needs its extra: pip install "goalgan_bt[syllabus]"'
+    raise ImportError(wanted) from error
 
 from goalgan_bt.curriculum.curriculum import GoalCurriculum
 from goalgan_bt.envs.gym_goals import Begin, goal_as_option

@@ -25,6 +25,7 @@ SETUP = (
     "head=",
     "export ",
     "uv pip",
+    "sed -i",
 )  # and no command of ours
 SMALL = (
     "--iterations 1 --rollout.num-envs 8 --rollout.steps 5 --coverage.rollouts 1 --gan.steps 2 "

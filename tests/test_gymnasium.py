@@ -220,6 +220,25 @@ def test_a_picture_shows_the_maze_and_the_goal_or_says_what_is_missing():
     assert drawn("off").startswith("no picture: pictures need OpenGL")
 
 
+WINDOW = """
+import gymnasium, goalgan_bt.gym
+from goalgan_bt.envs.goal_env import PhysicsError
+try:
+    gymnasium.make("goalgan_bt/PointUMaze-v0", render_mode="human").reset()
+except PhysicsError as error:
+    print(error)
+"""
+
+
+def test_a_window_without_a_screen_is_refused_and_ends_nothing():
+    """The viewer itself would end the process."""
+    nowhere = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    words = [sys.executable, "-c", WINDOW]
+    done = subprocess.run(words, capture_output=True, text=True, env=nowhere, timeout=120)
+    assert done.stdout == "a window needs a screen: use rgb_array instead\n", done.stderr
+    assert not done.stderr
+
+
 @pytest.mark.parametrize(
     ("settings", "problem"),
     [

@@ -48,7 +48,9 @@ class Export:
         self._note.remove()
         with self._directory:
             if self._process.returncode == 0:
-                self._client.send_file_download(self._name, self._path.read_bytes())
+                self._client.send_file_download(
+                    self._name, self._path.read_bytes(), save_immediately=True
+                )
             else:
                 assert self._process.stderr is not None
                 reason = self._process.stderr.read().decode(errors="replace")[-300:]

@@ -21,7 +21,7 @@ from goalgan_bt.envs.maze import Maze
 from goalgan_bt.learners.methods import METHODS
 from goalgan_bt.learners.run_config import RunConfig
 from goalgan_bt.recall.settings import BacktrackingConfig, ImitationConfig, PlacesConfig, too_much
-from goalgan_bt.runs.errors import RunError, UsageError
+from goalgan_bt.runs.errors import RunError, UsageError, require_installed
 from goalgan_bt.runs.ranges import ABOVE_ZERO, NOT_NEGATIVE, SHARE, Range, between
 from goalgan_bt.runs.run_folder import maze_of
 
@@ -248,6 +248,8 @@ def check(cfg: MazeConfig) -> None:
         )
     if cfg.device != "auto" and cfg.physics != "warp":
         raise UsageError("--device is mujoco-warp's: it goes with --physics warp")
+    if cfg.goals.source == "alp_gmm":
+        require_installed("study", "sklearn")
     if cfg.dim != 2 and cfg.env != "point_nd":
         raise UsageError(f"--dim goes with point_nd: {cfg.env} has two dimensions")
 
