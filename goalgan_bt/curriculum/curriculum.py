@@ -274,8 +274,8 @@ class GoalCurriculum:
             self.alp_gmm.add(goals, success)
 
     def see(self, places: FloatArray) -> None:
-        """Take in places where the agent has been, (m, goal_dim)."""
-        self.visited.add(places)
+        """Take in places where the agent has been, (m, goal_dim); a diverged body is nowhere."""
+        self.visited.add(places[np.isfinite(places).all(axis=1)])
 
     def judge(self, goals: FloatArray, success: FloatArray) -> Judged:
         """Label goals that were tried, and keep the intermediate ones for replay.

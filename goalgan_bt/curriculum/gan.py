@@ -62,10 +62,12 @@ class GoalGAN:
             steps: training steps, `cfg.steps` if None.
 
         Returns:
-            Mean losses of the last quarter: discriminator_loss, generator_loss (NaN if skipped).
+            Mean losses of the last quarter: discriminator_loss, generator_loss (NaN if skipped);
+            spread, how far the generator's goals are apart without the noise: their standard
+            deviation, in half sides of the box; near 0 where it has collapsed.
         """
         if not labels.any():
-            return {"discriminator_loss": np.nan, "generator_loss": np.nan}
+            return dict.fromkeys(("discriminator_loss", "generator_loss", "spread"), np.nan)
         steps = self.cfg.steps if steps is None else steps
         x = torch.from_numpy(self._normalise(goals)).float()
         target = torch.from_numpy(2.0 * labels - 1.0).float()[:, None]
@@ -87,7 +89,12 @@ class GoalGAN:
             self.generator_optimiser.step()
             losses[i] = error.square().mean().item(), miss.square().mean().item()
         discriminator, generator = losses[-max(1, steps // 4) :].mean(axis=0)
-        return {"discriminator_loss": discriminator, "generator_loss": generator}
+        spread = fake.std(dim=0).mean().item()
+        return {
+            "discriminator_loss": discriminator,
+            "generator_loss": generator,
+            "spread": spread,
+        }
 
     def _parts(self) -> dict[str, Any]:
         return {
@@ -96,6 +103,10 @@ class GoalGAN:
             "discriminator": self.discriminator,
             "discriminator_optimiser": self.discriminator_optimiser,
         }
+
+    def parameters(self) -> list[Tensor]:
+        """Those of both networks."""
+        return [self.generator.flat.detach(), self.discriminator.flat.detach()]
 
     def state_dict(self) -> dict[str, Any]:
         """Both networks and their optimisers."""

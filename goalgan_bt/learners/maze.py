@@ -32,9 +32,11 @@ from goalgan_bt.recall.traces import Traces, recall_traces
 from goalgan_bt.recall.transitions import Steps
 from goalgan_bt.runs import ranks
 from goalgan_bt.runs.background import group
-from goalgan_bt.runs.errors import UsageError
+from goalgan_bt.runs.errors import InterruptedRun, UsageError
 from goalgan_bt.runs.session import Limits, Schedule, Session
 from goalgan_bt.runs.signals import Stop
+from goalgan_bt.runs.sound import finite, soundly
+from goalgan_bt.runs.terminal import complain
 
 TEST_ENVS = 512  # simulations side by side when coverage is measured
 ANYWHERE = 1000  # goals of the first batch, uniform in the box
@@ -42,6 +44,7 @@ FRAME_TRACES = 64  # traces kept in a frame
 FRAME_PATHS = 32  # simulations whose paths are kept in a frame
 SEED_STATES = 2000  # experienced states among which the decoder looks
 KL_SAMPLE = 1024  # observations on which imitation's KL is bounded
+HOPELESS = 20  # batches in a row that taught nothing, after which no other will
 
 
 def train(cfg: MazeConfig, folder: Path | None, stop: Stop | None = None) -> Trained:
@@ -227,17 +230,21 @@ def practise(learner: MazeLearner, collector: Collector, goals: Goals, run: Sess
     with run.clock.measure("simulation"):
         rollouts, episodes = collector.collect(learner.policy, goals.all)
     run.count("train", batch_steps(learner.cfg))
+    diverged = ~np.isfinite(rollouts.achieved).all(axis=2)
+    run.tally("rollout/diverged", ranks.count(int(diverged.sum())))
     with run.clock.measure("learning"):
         run.background.wait("value", "backtracking")
         learner.remember(episodes)
         learner.learn_places(rollouts)
-        run.background.start("backtracking", learner.fit_model)
+        model = learner.forward or learner.backtracking
+        run.background.start("backtracking", soundly, model, learner.fit_model)
     return Batch(rollouts, episodes)
 
 
 def improve(learner: MazeLearner, batch: Batch, run: Session) -> Tensor:
     """A trust-region step on what happened. The value function learns beside it, and beside the
-    next rollouts: only after those it is needed again.
+    next rollouts: only after those it is needed again. A batch in which any number is not finite
+    teaches nothing.
 
     Returns:
         The normalised observations of the batch, (N * T, obs_dim).
@@ -247,14 +254,39 @@ def improve(learner: MazeLearner, batch: Batch, run: Session) -> Tensor:
         obs = policy.normaliser(flat(rollouts.obs))
         shaped = shaping(learner, rollouts)
         rewards = rollouts.rewards + shaped
+        if not teaches(learner, rollouts, rewards, run):
+            return obs
         advantages, returns = advantages_and_returns(learner, rollouts, rewards, obs)
-        run.background.start("value", learner.value.fit, obs, flat(returns), noise["value"])
+        run.background.start(
+            "value", soundly, learner.value, learner.value.fit, obs, flat(returns), noise["value"]
+        )
         step = trpo.update(
             policy, obs, flat(rollouts.actions), flat(advantages), learner.cfg.trpo, noise["trpo"]
         )
     run.note("trpo", step)
     run.note("rollout", {"reward": mean(rollouts.rewards), "shaping": mean(shaped)})
     return obs
+
+
+def teaches(learner: MazeLearner, rollouts: Rollouts, rewards: Float32, run: Session) -> bool:
+    """Whether all numbers of a batch, (T, N, ...), are finite on every rank. If not, tell so.
+
+    Raises:
+        InterruptedRun: if this goes on and on.
+    """
+    obs = rollouts.obs, rollouts.last_obs, rollouts.truncated_obs
+    sound = ranks.count(not finite(rewards, rollouts.actions, *obs)) == 0
+    learner.dropped = 0 if sound else learner.dropped + 1
+    run.tally("rollout/dropped", not sound)
+    if learner.dropped == 1:
+        at = f"iteration {run.iteration}"
+        complain(f"{at}: a batch is left out, since not all of it is finite", "warning")
+    if learner.dropped == HOPELESS:
+        raise InterruptedRun(
+            f"none of the last {HOPELESS} batches was finite: the environment or the policy is "
+            "broken"
+        )
+    return sound
 
 
 def advantages_and_returns(
@@ -324,7 +356,7 @@ def label(
         curriculum.see(collector.achieved_goals())
         labels, lesson = curriculum.judge(goals.all, success)
         if cfg.source in ("gan", "gan_fit_all"):
-            run.background.start("gan", curriculum.gan.fit, *lesson)
+            run.background.start("gan", soundly, curriculum.gan, curriculum.gan.fit, *lesson)
     return Labelled(success, labels)
 
 
@@ -386,7 +418,8 @@ def imitate(
         )
         # Only now: the policy must not change under data that it made. The last batch stands for
         # all of the iteration's.
-        learner.policy.normaliser.update(flat(batch.rollouts.obs))
+        if not learner.dropped:
+            learner.policy.normaliser.update(flat(batch.rollouts.obs))
     run.note("imitation", imitated)
 
 
@@ -494,7 +527,16 @@ def report(
 
 
 def save(learner: MazeLearner, collector: Collector, run: Session) -> None:
-    """A checkpoint with each measurement and at the end. All ranks take part."""
+    """A checkpoint with each measurement and at the end, of what is sound. All ranks take part.
+
+    Raises:
+        InterruptedRun: if it is not: the last checkpoint then stays.
+    """
+    if broken := learner.broken():
+        raise InterruptedRun(
+            f"iteration {run.iteration}: a weight of the {broken} is not finite, so that it cannot "
+            "learn any more"
+        )
     if not run.saves:
         return
     with run.clock.measure("saving"):

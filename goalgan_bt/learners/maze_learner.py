@@ -23,6 +23,7 @@ from goalgan_bt.recall.transitions import Transitions
 from goalgan_bt.runs import checkpoint, ranks
 from goalgan_bt.runs.errors import RunError
 from goalgan_bt.runs.session import STATE
+from goalgan_bt.runs.sound import finite
 
 NOISY = ("rollout", "evaluation", "trpo", "value", "gan", "backtracking", "imitation")
 
@@ -35,7 +36,7 @@ class MazeLearner:
         rng: numpy's generator; noise: torch's, one per part, since parts learn side by side.
         policy, value, curriculum, places, transitions, backtracking, imitation: the parts; forward:
             the one that only a control has, else None.
-        recalls: whether there are recall traces.
+        recalls: whether there are recall traces; dropped: batches in a row that were left out.
     """
 
     def __init__(self, env: GoalEnv, cfg: MazeConfig) -> None:
@@ -70,6 +71,7 @@ class MazeLearner:
             self.forward = ForwardModel(*sizes, cfg.backtracking, noise)
         self.transitions = Transitions(*sizes, env.goal_dim, cfg.backtracking)
         self.imitation = Imitation(self.policy, cfg.imitation, self.noise["imitation"])
+        self.dropped = 0
 
     def propose(self, env: GoalEnv) -> tuple[FloatArray, int]:
         """New goals, (n, goal_dim), and the environment steps that it took to find them.
@@ -93,7 +95,9 @@ class MazeLearner:
         lengths = episodes.lengths[episodes.kept]
         left = np.repeat(np.cumsum(lengths), lengths) - np.arange(lengths.sum()) - 1
         goals = np.repeat(goals, lengths, axis=0)
-        self.transitions.add(episodes.states, episodes.actions, episodes.next_states, goals, left)
+        rows = episodes.states, episodes.actions, episodes.next_states
+        if finite(*rows):  # one number that is none would end what learns from them
+            self.transitions.add(*rows, goals, left)
 
     def learn_places(self, rollouts: Rollouts) -> None:
         """Count the moves from place to place in the rollouts of all ranks, if anybody asks for
@@ -130,6 +134,15 @@ class MazeLearner:
             if network is not None
             for tensor in (*network.parameters(), *network.buffers())
         ]
+
+    def broken(self) -> str | None:
+        """The first part with a weight that is not finite, from which it cannot learn any more."""
+        parts = self._parts() | {"GAN": self.curriculum.gan}
+        for name, part in parts.items():
+            normaliser = [self.policy.normaliser.mean] if name == "policy" else []
+            if hasattr(part, "parameters") and not finite(*part.parameters(), *normaliser):
+                return name.replace("value", "value function")
+        return None
 
     def _parts(self) -> dict[str, Any]:
         """Everything with a `state_dict` and a `load_state_dict`."""

@@ -162,6 +162,10 @@ class Session:
         """Metrics of this iteration, under a common name."""
         self.row |= group(name, metrics)
 
+    def tally(self, name: str, n: float = 1) -> None:
+        """Count what happens now and then: a metric of this iteration by its whole name."""
+        self.row[name] = self.row.get(name, 0) + n
+
     def measures(self) -> bool:
         """Whether this iteration measures what the policy is worth: where that is due, and at the
         end. To be asked once, when everything else of the iteration is done. A run that is stopped

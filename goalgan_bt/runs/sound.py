@@ -2,11 +2,10 @@
 from it, and stay."""
 
 import copy
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 
@@ -17,23 +16,19 @@ def finite(*arrays: "np.ndarray | Tensor") -> bool:
     )
 
 
-def soundly(
-    part: Any, weights: Iterable[Tensor], learn: Callable[..., dict[str, float]], *args: Any
-) -> dict[str, float]:
+def soundly(part: Any, learn: Callable[..., dict[str, float]], *args: Any) -> dict[str, float]:
     """Let a part learn, and put it back to where it was if that leaves a weight that is not finite.
 
     Args:
-        part: has `state_dict` and `load_state_dict`, its optimisers included.
-        weights: those that it learns.
+        part: has `parameters`, `state_dict` and `load_state_dict`, its optimisers included.
         learn: called with the other arguments; gives metrics.
 
     Returns:
-        Its metrics, and `undone`, 1 if the lesson was.
+        Its metrics, and `undone`, 1 if the lesson was undone.
     """
     before = copy.deepcopy(part.state_dict())
     metrics = learn(*args)
-    with torch.no_grad():
-        if finite(*weights):
-            return metrics | {"undone": 0.0}
+    if finite(*part.parameters()):
+        return metrics | {"undone": 0.0}
     part.load_state_dict(before)
     return {"undone": 1.0}
