@@ -56,6 +56,7 @@ LAYOUTS = {
 }
 
 
+MOST_CELLS = 10_000  # of a map: walls, coverage and ways of more take minutes and gigabytes
 _ZERO = np.zeros(())
 
 
@@ -229,7 +230,10 @@ def load(path: Path, cell_size: float = 2.0) -> Maze:
         MapError: as `Maze`, or if the file cannot be read as text.
     """
     try:
-        return parse(path.read_text(encoding="utf-8"), cell_size)
+        if path.exists() and not path.is_file():
+            raise OSError("it is no file")
+        with path.open(encoding="utf-8-sig") as file:
+            return parse(file.read(4 * MOST_CELLS), cell_size)
     except (OSError, UnicodeDecodeError) as error:
         raise MapError(f"cannot read the map {path}: {error}") from error
     except MapError as error:
@@ -253,6 +257,8 @@ def _distances(free: BoolArray, start: tuple[int, int]) -> NDArray[np.int64]:
 def _check(rows: tuple[str, ...]) -> None:
     if not rows or not any(rows):
         raise MapError("the map is empty")
+    if sum(map(len, rows)) > MOST_CELLS:
+        raise MapError(f"the map has more than {MOST_CELLS:,} cells")
     starts = []
     for r, row in enumerate(rows, 1):
         if len(row) != len(rows[0]):

@@ -17,6 +17,8 @@ if __name__ == "__main__":
 import contextlib
 import importlib
 import inspect
+import os
+import resource
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -27,6 +29,7 @@ from goalgan_bt.learners.run_config import RunConfig, Trained
 from goalgan_bt.learners.table import from_command_line, learner_of
 from goalgan_bt.runs.command_line import run_command
 from goalgan_bt.runs.errors import UsageError
+from goalgan_bt.runs.files import check_own
 from goalgan_bt.runs.run_folder import ended, mend_meta, new_run
 from goalgan_bt.runs.signals import Stop
 from goalgan_bt.runs.terminal import complain, say
@@ -99,6 +102,7 @@ def run(cfg: RunConfig, module: Any, stop: Stop, begun: Begun) -> Trained:
             if folder is None:
                 folder = new_run(cfg.out, world.name, cfg.seed, asdict(cfg), world.maze)
             else:
+                check_own(folder)
                 mend_meta(folder, world.maze)
             begun(folder)
             say(f"run folder: {folder}")
@@ -123,6 +127,7 @@ def main(argv: list[str] | None = None) -> int:
         folder = there
 
     def work() -> int:
+        bound_memory()
         cfg = from_command_line(sys.argv[1:] if argv is None else argv)
         with nothing_to_lose(f"interrupted: {NOTHING}"):  # torch takes seconds to import
             module = importlib.import_module(learner_of(cfg.env).module)
@@ -135,6 +140,15 @@ def main(argv: list[str] | None = None) -> int:
         return stop.code
 
     return run_command(work, lambda: how_to_go_on(folder))
+
+
+def bound_memory() -> None:
+    """Let this process have no more memory than the machine has: settings that want more then end
+    in one line, where the system would let them begin and kill something later."""
+    limit, most = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"), resource.RLIM_INFINITY
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    known = [bound for bound in (limit, soft, hard) if bound != most]
+    resource.setrlimit(resource.RLIMIT_DATA, (min(known), hard))
 
 
 def how_to_go_on(folder: Path | None) -> str:

@@ -21,6 +21,7 @@ def done(iteration, tested, trained, seconds, value):
     """Of a checkpoint what is not the agent's."""
     steps = {"train": trained, "label": 0, "eval": tested}
     run = {"iteration": iteration, "steps": steps, "seconds": seconds, "next_measurement": 0.0}
+    run |= {"metrics": {}}
     return {"run": run, "return": value}
 
 

@@ -50,18 +50,18 @@ def test_runs_of_any_name_can_be_drawn(folder, tmp_path):
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("damage", ["frame", "meta", "metrics"])
+@pytest.mark.parametrize("damage", ["frames", "meta", "metrics"])
 def test_damaged_runs_are_one_line(folder, tmp_path, damage):
     other = tmp_path / "point_umaze-damaged"
     shutil.copytree(folder, other)
-    if damage == "frame":
-        frame = frame_paths(other)[0]
+    if damage == "frames":
+        frame = frame_paths(other)[1]
         frame.write_bytes(frame.read_bytes()[:100])
     elif damage == "meta":
         (other / "meta.json").write_text("{}")
     else:
         (other / "metrics.csv").write_bytes(bytes(range(256)))
-    done = plot(other)
+    done = plot(other, *(["--at", 2] if damage == "frames" else []))
     assert done.returncode == 2
     assert len(done.stderr.strip().splitlines()) == 1 and "Traceback" not in done.stderr
 

@@ -1,5 +1,6 @@
 """The plug-in for Stable-Baselines3: three agents on a task that knows nothing of us."""
 
+import copy
 import time
 
 import gymnasium
@@ -202,6 +203,38 @@ def test_agents_that_are_not_gaussian_are_refused():
         PPO("MlpPolicy", stacked).learn(10, callback=RecallTraces())
     with pytest.raises(ValueError, match="nothing was learned"):
         RecallTraces().save("nowhere")
+
+
+@pytest.mark.parametrize("name", ["PPO", "TRPO", "SAC"])
+@pytest.mark.parametrize("model", ["backward", "forward"])
+def test_saved_and_loaded_it_goes_on_as_if_it_had_not_been(name, model, tmp_path):
+    """Agent, callback and environments: bit for bit, in the middle of episodes."""
+
+    def taught(loaded):
+        env = make_vec_env(Reach, n_envs=1 if name == "SAC" else 2, seed=0)
+        learner = agent(name, env, **({} if name == "SAC" else {"n_steps": 64, "batch_size": 64}))
+        cfg = RecallConfig(trace_length=5, min_steps=20, every=128, model=model)
+        callback = RecallTraces(cfg)
+        learner.learn(407 if name == "SAC" else 512, callback=callback)
+        assert callback.unfinished != [0] * env.num_envs
+        if loaded:
+            noise = torch.get_rng_state(), np.random.get_state()  # noqa: NPY002 (its own)
+            learner.save(tmp_path / "agent.zip")
+            callback.save(tmp_path / "recall.pt")
+            seen = getattr(learner, "replay_buffer", None)
+            kind = AGENTS[name]
+            learner = kind.load(tmp_path / "agent.zip", copy.deepcopy(env), force_reset=False)
+            learner.replay_buffer = copy.deepcopy(seen)
+            callback = RecallTraces.load(tmp_path / "recall.pt")
+            torch.set_rng_state(noise[0])
+            np.random.set_state(noise[1])  # noqa: NPY002
+        learner.learn(512, callback=callback, reset_num_timesteps=False)
+        return learner.policy.state_dict(), callback
+
+    (one, first), (two, second) = taught(False), taught(True)
+    assert first.last and first.last == second.last
+    assert all(torch.equal(one[key], two[key]) for key in one)
+    assert first._rng.random() == second._rng.random()
 
 
 def test_what_was_saved_for_another_task_is_refused(tmp_path):

@@ -5,9 +5,7 @@ from goalgan_bt.runs.signals import leave_at_once
 if __name__ == "__main__":
     leave_at_once()
 
-import ipaddress
 import os
-import socket
 import sys
 import threading
 from dataclasses import dataclass
@@ -86,6 +84,7 @@ def serve(cfg: ViewConfig) -> None:
     """
     # Only now: this imports torch and MuJoCo, and --help shall not wait for them.
     from goalgan_bt.viz.run import Run
+    from goalgan_bt.viz.server import is_loopback
     from goalgan_bt.viz.view import View
 
     os.nice(19)  # looking must not slow learning; threads take it from the one that starts them
@@ -93,7 +92,7 @@ def serve(cfg: ViewConfig) -> None:
     view = View([Run(folder) for folder in cfg.runs], cfg.host, port)
     busy = cfg.port not in (0, view.server.get_port())
     say(f"view: {view.address}" + (f" (port {cfg.port} was busy)" if busy else ""))
-    if not _is_loopback(cfg.host):
+    if not is_loopback(cfg.host):
         say("view: everybody who can reach this machine can use it: there is no password")
     # viser tells of every connection, and who started this may listen no more.
     sys.stdout = open(os.devnull, "w")  # noqa: SIM115
@@ -141,12 +140,6 @@ def from_command_line(argv: list[str] | None = None) -> ViewConfig:
         raise UsageError("--host must name an address: 127.0.0.1 is this machine alone")
     check_ranges(cfg)
     return cfg
-
-
-def _is_loopback(host: str) -> bool:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    addresses = {str(found[4][0]) for found in socket.getaddrinfo(host, None, family)}
-    return all(ipaddress.ip_address(address).is_loopback for address in addresses)
 
 
 def _wait_for_parent() -> None:

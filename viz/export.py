@@ -16,6 +16,7 @@ from viser.infra import StateSerializer
 
 from goalgan_bt.runs.errors import RunError
 from goalgan_bt.runs.files import write_atomically
+from goalgan_bt.runs.terminal import complain
 from goalgan_bt.viz.body import Bodies
 from goalgan_bt.viz.captions import caption, settings_rows, state
 from goalgan_bt.viz.curves import COLOURS, PLOTS, levels, series
@@ -54,6 +55,7 @@ def export(run: Run, path: Path) -> None:
         for i in track(picks.round().astype(int), "export", transient=True):
             frame = run.frame(run.iterations[i])
             if frame is None:
+                complain(f"report {run.iterations[i]} of {run.folder} is damaged", "warning")
                 continue
             scene.draw(_smaller(frame))
             steps = run.metrics.at(run.iterations[i], "steps/train") / 1e6

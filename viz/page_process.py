@@ -1,6 +1,7 @@
 """The page that training opens: `python -m goalgan_bt.viz` as a child process."""
 
 import contextlib
+import signal
 import socket
 import subprocess
 import sys
@@ -62,6 +63,7 @@ class PageProcess:
 
     def _listen(self) -> None:
         assert self._process is not None and self._process.stdout is not None
+        last = "it said nothing"
         for line in self._process.stdout:
             # Nobody may read our output any more; the page's must be read on, lest it block.
             with contextlib.suppress(OSError, ValueError):
@@ -72,6 +74,9 @@ class PageProcess:
                     say(line.strip())
                 elif line.startswith("error: "):
                     complain(line.removeprefix("error: ").strip())
+                last = line.strip() or last
+        if self._address is None and self._process.wait() not in (0, 2, -signal.SIGTERM):
+            complain(f"there is no page, training goes on: it ended with: {last}", "warning")
         self._known.set()
 
 

@@ -14,6 +14,7 @@ from goalgan_bt.runs import run_folder
 from goalgan_bt.runs.errors import RunError
 from goalgan_bt.runs.frames import frame_paths, read_frame
 from goalgan_bt.runs.metrics_csv import read_metrics
+from goalgan_bt.runs.terminal import complain
 from goalgan_bt.study.published import Published, published
 from goalgan_bt.viz.run import Run, labels, places, success
 
@@ -118,8 +119,15 @@ def coverage_map(ax: Axes, folder: Path, frame: Path, goals: float = 7.0) -> Any
 
 
 def measured_frames(folder: Path) -> list[Path]:
-    """The frames that hold a measured coverage, oldest first."""
-    return [frame for frame in frame_paths(folder) if success(read_frame(frame))[1]]
+    """The frames that hold a measured coverage, oldest first; one that is damaged is told."""
+    measured = []
+    for frame in frame_paths(folder):
+        try:
+            if success(read_frame(frame))[1]:
+                measured.append(frame)
+        except RunError as error:
+            complain(f"{error}: it is left out", "warning")
+    return measured
 
 
 def frames_at(folder: Path, iterations: tuple[int, ...]) -> list[Path]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from goalgan_bt.envs.maze import FloatArray
 from goalgan_bt.runs import run_folder
 from goalgan_bt.runs.errors import RunError
+from goalgan_bt.runs.files import read_own
 from goalgan_bt.runs.frames import frame_paths, read_frame
 from goalgan_bt.runs.metrics_csv import Metrics
 
@@ -44,7 +45,7 @@ class Run:
         self.folder, self.name = folder, folder.resolve().name
         self.maze = run_folder.maze_of(folder)
         try:
-            settings = json.loads((folder / "config.json").read_text())
+            settings = json.loads(read_own(folder / "config.json", run_folder.SMALL))
             self.env, self.settings = str(settings["env"]), dict(settings)
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             raise RunError(f"{folder} is no run: it has no readable config.json") from None

@@ -2,13 +2,39 @@
 
 import contextlib
 import io
+import ipaddress
+import socket
 from typing import Any
 from urllib.parse import urlsplit
 
 import viser
 import websockets.asyncio.server
+from viser import _messages
 
-LOOPBACK = ("localhost", "127.0.0.1", "::1")
+MOST_VISITORS = 64  # at a time
+MOST_SENT = 2**20  # bytes of one message from a browser: clicks and the like are all
+
+
+def is_loopback(host: str) -> bool:
+    """Whether who listens at that name or address is heard on this machine alone.
+
+    Raises:
+        OSError: if there is no such name.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    addresses = {str(found[4][0]) for found in socket.getaddrinfo(host, None, family)}
+    return all(ipaddress.ip_address(address).is_loopback for address in addresses)
+
+
+def of_this_machine(asked: str | None) -> bool:
+    """Whether a `Host` names this machine as only who is on it can mean it. A foreign name that was
+    made to point here is none."""
+    if asked is None or asked == "localhost":
+        return asked is not None
+    try:
+        return ipaddress.ip_address(asked).is_loopback
+    except ValueError:
+        return False
 
 
 def start_server(host: str, port: int) -> viser.ViserServer:
@@ -16,27 +42,46 @@ def start_server(host: str, port: int) -> viser.ViserServer:
 
     viser lets a page of any other site, open in the same browser, read everything and press every
     button. Here a websocket must come from the page itself: its `Origin` must be the `Host` that it
-    asks, and on this machine alone that host must be a name of this machine (a foreign name that
-    was made to point here is none).
+    asks, and where only this machine is let in that host must be a name of this machine. Nobody
+    sends files here, and not more may look at a time than `MOST_VISITORS`.
 
     Args:
         host, port: where to listen.
     """
     serve = websockets.asyncio.server.serve
+    alone, here = is_loopback(host), 0
 
-    def guarded(*args: Any, process_request: Any, **settings: Any) -> Any:
+    def guarded(handler: Any, *args: Any, process_request: Any, **settings: Any) -> Any:
         def check(connection: Any, request: Any) -> Any:
             asked, origin = request.headers.get("Host", ""), request.headers.get("Origin")
-            foreign = origin is not None and urlsplit(origin).netloc != asked
-            if foreign or (host in LOOPBACK and urlsplit(f"//{asked}").hostname not in LOOPBACK):
+            try:
+                own = origin is None or urlsplit(origin).netloc == asked
+                named = not alone or of_this_machine(urlsplit(f"//{asked}").hostname)
+            except ValueError:  # a name that is none
+                own = False
+            if not (own and named):
                 return connection.respond(403, "This page talks to its own site only.\n")
+            if here >= MOST_VISITORS and "Upgrade" in request.headers:
+                return connection.respond(503, "Too many are looking: try again later.\n")
             return process_request(connection, request)
 
-        return serve(*args, process_request=check, **settings)
+        async def counted(connection: Any) -> None:
+            nonlocal here
+            here += 1
+            try:
+                await handler(connection)
+            finally:
+                here -= 1
+
+        settings["max_size"] = MOST_SENT
+        return serve(counted, *args, process_request=check, **settings)
 
     websockets.asyncio.server.serve = guarded  # type: ignore[assignment, misc]
     try:
         with contextlib.redirect_stdout(io.StringIO()):
-            return viser.ViserServer(host=host, port=port, label="goalgan_bt")
+            server = viser.ViserServer(host=host, port=port, label="goalgan_bt")
     finally:
         websockets.asyncio.server.serve = serve  # type: ignore[misc]
+    for message in (_messages.FileTransferStartUpload, _messages.FileTransferPart):
+        server._websock_server.unregister_handler(message)  # it would keep whatever is sent
+    return server

@@ -11,6 +11,7 @@ which is unrolled from the most valuable states; the policy imitates those trace
 observation: the environment need know nothing of us.
 """
 
+import ast
 import time
 from collections import deque
 from dataclasses import asdict
@@ -118,6 +119,11 @@ class RecallTraces(BaseCallback):
         self._sizes = (0, 0)  # of observations and actions of the model
         self._now: FloatArray = np.empty(0)  # observations before the next step
         self._learning = False  # until `learn` has come to its end
+        # Of each environment's episode that goes on: observation, action, reward of each step; and
+        # whether it was seen from its beginning.
+        self._paths: list[list[tuple[Any, Any, float]]] = []
+        self._whole = np.empty(0, dtype=bool)
+        self._loaded = False  # and not gone on with yet
         self.last: dict[str, float] = {}
         self.seconds = 0.0
 
@@ -139,10 +145,13 @@ class RecallTraces(BaseCallback):
                 f"the agent's have {agent.sizes}: take a new one"
             )
         if self.agent is None or self.agent.model is not self.model:
-            self.agent, self._turned = agent, self.model.num_timesteps
-            self.imitation = AgentImitation(agent, self.cfg, self._rng)
-            self._paths: list[list[tuple[Any, Any, float]]] = [[] for _ in range(self.model.n_envs)]
-            self._whole = np.zeros(self.model.n_envs, dtype=bool)  # seen from their beginning
+            self.agent, self.imitation = agent, AgentImitation(agent, self.cfg, self._rng)
+            if not self._loaded:
+                self._turned = self.model.num_timesteps
+            if not self._loaded or len(self._paths) != self.model.n_envs:
+                self._paths = [[] for _ in range(self.model.n_envs)]
+                self._whole = np.zeros(self.model.n_envs, dtype=bool)
+            self._loaded = False
         if self._moments is not None and _fit(self._moments, self._imitating.optimiser):
             checkpoint.restore(self._imitating.optimiser, self._moments)
         self._moments = None
@@ -345,7 +354,8 @@ class RecallTraces(BaseCallback):
         return told[kept], done[kept], valid
 
     def state_dict(self) -> dict[str, Any]:
-        """Settings, model and trajectories, to go on with a saved agent.
+        """Settings, model, trajectories, episodes that go on and random generators: what it takes
+        to go on with a saved agent as if nothing had been saved.
 
         Raises:
             ValueError: if no episode has ended yet.
@@ -361,6 +371,15 @@ class RecallTraces(BaseCallback):
                 [*(torch.from_numpy(x) for x in one[:3]), one.terminated]
                 for one in self.trajectories
             ],
+            "paths": [
+                [torch.from_numpy(np.array(part)) for part in zip(*path, strict=True)]
+                for path in self._paths
+            ],
+            "whole": torch.from_numpy(self._whole),
+            "now": torch.from_numpy(np.array(self._now)),
+            "turned": self._turned,
+            "rng": repr(self._rng.bit_generator.state),  # integers too long for a tensor
+            "noise": self._noise.get_state(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -390,6 +409,14 @@ class RecallTraces(BaseCallback):
         if not all(param.isfinite().all() for param in self.dynamics.parameters()):
             raise ValueError("the model has numbers that are not finite")
         self._moments = state["optimiser"]
+        self._paths = [
+            list(zip(path[0].numpy(), path[1].numpy(), path[2].tolist(), strict=True))
+            for path in (path or (torch.empty(0),) * 3 for path in state["paths"])
+        ]
+        self._whole, self._now = state["whole"].numpy().copy(), state["now"].numpy().copy()
+        self._turned, self._loaded = int(state["turned"]), True
+        self._rng.bit_generator.state = ast.literal_eval(state["rng"])
+        self._noise.set_state(state["noise"])
 
     def save(self, path: Path | str) -> None:
         """Write the `state_dict`, to go on with a saved agent (`load`).
@@ -401,22 +428,19 @@ class RecallTraces(BaseCallback):
         checkpoint.save(self.state_dict(), Path(path))
 
     @classmethod
-    def load(
-        cls, path: Path | str, cfg: RecallConfig | None = None, seed: int = 0
-    ) -> "RecallTraces":
+    def load(cls, path: Path | str, cfg: RecallConfig | None = None) -> "RecallTraces":
         """What `save` wrote, to be given to `learn` of the loaded agent.
 
         Args:
             path: of the file.
             cfg: settings; those that were saved if None.
-            seed: as of a new one.
 
         Raises:
             OSError: if the file cannot be opened.
             ValueError: if it is damaged, or made with another `RecallConfig.model`.
         """
         with checkpoint.loaded(Path(path)) as state:
-            callback = cls(cfg or RecallConfig(**state["cfg"]), seed)
+            callback = cls(cfg or RecallConfig(**state["cfg"]))
             if (kind := state["cfg"]["model"]) != callback.cfg.model:
                 raise ValueError(f"its model is {kind}, not {callback.cfg.model}")
             callback.load_state_dict(state)

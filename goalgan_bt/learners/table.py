@@ -139,7 +139,9 @@ def from_command_line(argv: list[str]) -> Any:
     run = value_of(argv, "--resume")
     default: RunConfig
     if run is not None:
-        default = replace(load(Path(run)), resume=Path(run))
+        # The folder may be somebody else's: who looks, and from where, is for this command to say.
+        looking = {name: getattr(RunConfig, name) for name in ("viz", "viz_host", "viz_port")}
+        default = replace(load(Path(run)), resume=Path(run), **looking)
         learner = learner_of(default.env)
     else:
         env = value_of(argv, "--env") or DEFAULT

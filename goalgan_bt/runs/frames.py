@@ -1,6 +1,7 @@
 """Frames: what a report shows, as arrays, a file each."""
 
 import re
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +27,12 @@ def read_frame(path: Path) -> dict[str, np.ndarray[Any, Any]]:
         RunError: if it cannot be read.
     """
     try:
-        with open_own(path) as file, np.load(file, allow_pickle=False) as data:
-            if sum(part.file_size for part in data.zip.infolist()) > LARGE:
+        with open_own(path) as file, zipfile.ZipFile(file) as archive:
+            if sum(part.file_size for part in archive.infolist()) > LARGE:
                 raise ValueError("what it holds is too large for a frame")
-            arrays = {name: np.asarray(data[name]) for name in data.files}
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as data:
+                arrays = {name: np.asarray(data[name]) for name in data.files}
     except Exception as error:  # a damaged archive raises many kinds
         raise RunError(f"cannot read the frame {path}: {error}") from None
     for name, dims in (("goals", 2), ("test_goals", 2), ("coverage", 1)):
