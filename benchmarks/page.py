@@ -9,6 +9,7 @@ browser would, but draws nothing, as if the browser were on another machine.
 import json
 import os
 import shutil
+import socket
 import subprocess
 import sys
 import tempfile
@@ -41,6 +42,8 @@ class PageConfig:
     """Measurements of each kind."""
     pages: tuple[int, ...] = (0, 1, 20)
     """Numbers of visitors to compare; the first is the reference."""
+    rude: int = 0
+    """How many of the visitors misbehave, where there are so many (see `rude_visitor`)."""
     reports: int = 3600
     """Reports that pass while the page's memory is watched; 0: none."""
     pause: float = 1.0
@@ -56,16 +59,44 @@ def visitor(port: int) -> None:
     try:
         with websockets.sync.client.connect(
             f"ws://127.0.0.1:{port}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None
-        ) as socket:
-            socket.send(msgspec.msgpack.encode(message))
-            for _ in socket:
+        ) as browser:
+            browser.send(msgspec.msgpack.encode(message))
+            for _ in browser:
                 pass
     except (OSError, websockets.exceptions.WebSocketException):
         pass
 
 
-def serve(folder: Path, visitors: int) -> subprocess.Popen[str]:
-    """A page over a run with so many visitors, who are in a process of their own."""
+def rude_visitor(port: int, kind: int) -> None:
+    """Misbehave until the page goes: 0 sends nonsense as fast as it can, 1 comes and goes, 2 sends
+    what is too large, 3 never reads what it gets, 4 asks for files outside, under another name."""
+    connect = websockets.sync.client.connect
+    address, ours = f"ws://127.0.0.1:{port}", [f"viser-v{viser.__version__}"]
+    update = _messages.GuiUpdateMessage("nobody", {"value": "../../etc/passwd"})
+    nonsense = msgspec.msgpack.encode(update.as_serializable_dict())
+    request = b"GET /../../etc/passwd HTTP/1.1\r\nHost: evil.example\r\n\r\n"
+    while True:
+        try:
+            if kind == 4:
+                with socket.create_connection(("127.0.0.1", port), timeout=5) as line:
+                    line.sendall(request)
+                    line.recv(100)
+                continue
+            with connect(address, subprotocols=ours, max_size=None) as browser:
+                while kind == 0:
+                    browser.send(nonsense)
+                if kind == 2:
+                    browser.send(bytes(2**24))
+                if kind == 3:
+                    time.sleep(1e6)
+        except ConnectionRefusedError:
+            return
+        except (OSError, websockets.exceptions.WebSocketException):
+            continue
+
+
+def serve(folder: Path, visitors: int, rude: int = 0) -> subprocess.Popen[str]:
+    """A page over a run with so many visitors, some of them rude, in a process of their own."""
     page = subprocess.Popen(
         [sys.executable, "-m", "goalgan_bt.viz", folder, "--port", "0", "--with-parent"],
         stdin=subprocess.PIPE,
@@ -77,7 +108,12 @@ def serve(folder: Path, visitors: int) -> subprocess.Popen[str]:
     if os.fork() == 0:
         page.stdin.close()  # or else the page would never see its end
         os.nice(19)  # they would use another machine's cores
-        threads = [threading.Thread(target=visitor, args=(port,)) for _ in range(visitors)]
+        polite = max(0, visitors - rude)
+        threads = [threading.Thread(target=visitor, args=(port,)) for _ in range(polite)]
+        threads += [
+            threading.Thread(target=rude_visitor, args=(port, i % 5))
+            for i in range(visitors - polite)
+        ]
         for thread in threads:
             thread.start()
         for thread in threads:
@@ -96,7 +132,8 @@ def steps_per_second(cfg: PageConfig, visitors: int, out: Path) -> float:
     threading.Thread(target=training.stdout.read, daemon=True).start()
     while not list((folder / "frames").glob("*.npz")):
         time.sleep(0.2)
-    page = serve(folder, visitors) if visitors else None
+    rude = cfg.rude if visitors >= cfg.rude else 0
+    page = serve(folder, visitors, rude) if visitors else None
     time.sleep(8 + cfg.seconds)
     training.kill()
     training.wait()
@@ -157,6 +194,7 @@ def main() -> None:
                     "name": "training",
                     "env": cfg.env,
                     "visitors": visitors,
+                    "rude": cfg.rude if visitors >= cfg.rude else 0,
                     "steps_per_second": [round(x) for x in speeds],
                     "ratio": round(float(np.median(ratio)), 3),
                 }

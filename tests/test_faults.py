@@ -11,12 +11,15 @@ import torch
 from conftest import call
 from test_resume import new_folder, rows_of, settings
 
+from goalgan_bt.agent.coverage import coverage
 from goalgan_bt.agent.policy import ValueFunction
 from goalgan_bt.agent.rollout import Collector
 from goalgan_bt.curriculum.gan import GoalGAN
 from goalgan_bt.envs.mujoco_env import MujocoEnv
 from goalgan_bt.envs.point_maze import PointMaze
 from goalgan_bt.learners import maze, maze_learner
+from goalgan_bt.learners.maze_config import make_env
+from goalgan_bt.learners.maze_learner import MazeLearner
 from goalgan_bt.recall.backtracking import BacktrackingModel
 from goalgan_bt.runs import checkpoint
 from goalgan_bt.runs.errors import InterruptedRun
@@ -240,3 +243,58 @@ def test_the_same_seed_gives_the_same_bits_with_other_threads(more, tmp_path):
     maze.train(replace(other, seed=cfg.seed), folders[1])
     assert rows_of(folders[0]) == rows_of(folders[1])
     assert np.isfinite(float(rows_of(folders[0])[-1]["eval/coverage"]))
+
+
+@pytest.mark.parametrize(("env", "tiles"), [("ant_umaze", 12), ("point_umaze", 0)])
+def test_a_body_that_does_not_move_has_the_known_coverage(env, tiles):
+    """A policy that says nothing to motors: what coverage finds is the floor that is told."""
+    sims = make_env(settings(env, "recall_traces"), 128)
+
+    policy = MazeLearner(sims, settings(env, "recall_traces")).policy
+    policy.net.flat.data.zero_()
+    found = coverage(sims, policy, sims.test_goals(), 1, torch.Generator().manual_seed(0))
+    assert found.deterministic.sum() == tiles
+    assert maze.still(sims) == pytest.approx(tiles / 112)
+
+
+def test_a_goal_in_a_wall_is_never_reached():
+    sims = make_env(settings("ant_umaze", "recall_traces"), 4)
+    wall = np.array([[0.0, 1.6]] * 4)  # within a metre of the start, and in the wall above it
+    assert not sims.feasible(wall).any()
+    assert sims.reached(np.array([[0.0, 0.7]] * 4), wall).all()
+    sims.reset(np.arange(4), wall)
+    step = sims.step(np.arange(4), np.zeros((4, 8)))
+    assert not step.rewards.any() and not step.terminated.any()
+
+
+def test_a_scripted_policy_covers_what_it_reaches():
+    """A point that is pushed to the right and nowhere else reaches the tiles on its way."""
+    sims = make_env(settings("point_umaze", "recall_traces", "--horizon", "400"), 128)
+    policy = MazeLearner(sims, settings("point_umaze", "recall_traces")).policy
+    policy.net.flat.data.zero_()
+    policy.net.views()[-2].copy_(torch.tensor([1.0, 0.0]))  # the last bias: always to the right
+    goals = sims.test_goals()
+    found = coverage(sims, policy, goals, 1, torch.Generator().manual_seed(0)).deterministic
+    sims.reset(np.arange(1), goals[:1] + 100)
+    way = []
+    for _ in range(100):
+        way.append(sims.step(np.arange(1), np.array([[1.0, 0.0]])).achieved[0])
+    near = np.linalg.norm(goals[:, None] - np.array(way), axis=2).min(axis=1) < sims.success_radius
+    assert 0 < near.sum() < 20 and np.array_equal(found > 0, near)
+
+
+def test_shaping_is_no_success(tmp_path, monkeypatch):
+    """However much of it: what counts as reached stays what the environment says."""
+    won = []
+
+    def spoil(result, _):
+        won.append(result[0].rewards.mean())
+        assert set(np.unique(result[0].rewards)) <= {0.0, 1.0}
+
+    for at in range(1, 20):
+        once(monkeypatch, Collector, "collect", at, spoil)
+    _, rows = trained(tmp_path, "--places.shaping", "1000", "--horizon", "4")
+    assert max(abs(float(row["rollout/shaping"])) for row in rows) > 1
+    told = [float(row["rollout/reward"]) for row in rows]
+    assert told == pytest.approx(won[2::2], rel=1e-4)  # of each iteration's last batch
+    assert {row["eval/coverage"] for row in rows if row["eval/coverage"]} == {"0"}

@@ -1,5 +1,6 @@
 """Pictures of run folders with matplotlib: coverage over steps, coverage over the maze."""
 
+import contextlib
 import math
 from pathlib import Path
 from typing import Any
@@ -62,11 +63,22 @@ def curve(ax: Axes, folders: list[Path], until: int | None = None) -> None:
         label = f"{line.method} (published)"
         ax.plot(*zip(*line.points, strict=True), "o--", color=grey, markersize=3, label=label)
         ax.set_xscale("log")
+    floors = [value for _, rows in tables for value in last_of(rows, "eval/floor") if value > 0]
+    if floors:
+        ax.axhline(min(floors), color="0.6", lw=0.8, ls=":", label="a body that does not move")
     ax.set(xlabel="environment steps of training", ylabel=measure)
     if measure == "coverage":
         ax.set_ylim(0, 1.02)
     ax.grid(alpha=0.25)
     ax.legend(fontsize=7, frameon=False, loc="upper left" if measure == "coverage" else "best")
+
+
+def last_of(rows: list[dict[str, str]], name: str) -> list[float]:
+    """The last value of a metric that is known and a number, if any is."""
+    for row in reversed(rows):
+        with contextlib.suppress(ValueError):
+            return [float(row.get(name) or "")]
+    return []
 
 
 def _title(run: Run) -> str:

@@ -154,16 +154,18 @@ class Collector:
             ValueError: if it is of another body or other times.
         """
         rows = {name: row.numpy() for name, row in state.items()}
-        age, longest = rows["age"], self.env.horizon // self.env.action_repeat
+        age, longest = rows["age"], math.ceil(self.env.horizon / self.env.action_repeat)
         if not self.env.settable or len(age) != self._total:
             complain("the simulations begin anew: this is not the same run, bit for bit", "note")
             self.begin(rows["goals"])
             return
-        if age.min() < 0 or age.max() > longest:
-            raise ValueError("its episodes are too long")
         for name, table in self.env.state_dict().items():
             if rows[name].shape != (self._total, *table.shape[1:]):
                 raise ValueError(f"the {name} of its simulations are of other sizes")
+        if age.min() < 0 or age.max() >= longest:
+            raise ValueError("its episodes are too long")
+        if (rows["elapsed"] != age * self.env.action_repeat).any():
+            raise ValueError("the clocks of its simulations do not fit their episodes")
         self.env.load_state_dict({name: rows[name][self._mine] for name in self.env.state_dict()})
         self._age[:], self._from_start[:] = age[self._mine], rows["from_start"][self._mine]
         before = age[: self._mine.start]  # of other ranks

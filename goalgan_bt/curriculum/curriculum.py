@@ -139,7 +139,7 @@ class GoalCurriculum:
         if not self._asked:
             raise UsageError("nothing was asked for yet: call ask() first, and tell how it went")
         tried, places = self._rows(goals, "goals"), self._rows(visited, "visited")
-        outcome = np.asarray(success, dtype=float)
+        outcome = _numbers(success, "success")
         if outcome.shape != (len(tried),):
             raise UsageError(
                 f"success must have one number for each of the {len(tried)} goals, "
@@ -343,7 +343,7 @@ class GoalCurriculum:
             UsageError: naming what is wrong with them.
         """
         dim = len(self.low)
-        rows = np.empty((0, dim)) if goals is None else np.asarray(goals, dtype=float)
+        rows = np.empty((0, dim)) if goals is None else _numbers(goals, name)
         if rows.ndim != 2 or rows.shape[1] != dim:
             raise UsageError(f"{name} must be rows of {dim} numbers, not the shape {rows.shape}")
         skin = 1e-6 * (self.high - self.low)  # single precision
@@ -361,6 +361,18 @@ class GoalCurriculum:
 
     def _outward(self, goals: FloatArray) -> FloatArray:
         return np.clip(self._centre + self._unit * goals, self.low, self.high)
+
+
+def _numbers(given: ArrayLike, name: str) -> FloatArray:
+    """An array of numbers.
+
+    Raises:
+        UsageError: if it is none.
+    """
+    try:
+        return np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        raise UsageError(f"{name} must be an array of numbers") from None
 
 
 def _check(seed: int, every: int, goals: GoalsConfig, gan: GanConfig) -> None:

@@ -21,7 +21,7 @@ from goalgan_bt.recall.settings import RecallConfig
 from goalgan_bt.runs.errors import RunError, UsageError
 from goalgan_bt.runs.ranges import between
 from goalgan_bt.runs.run_folder import end_run
-from goalgan_bt.runs.session import STATE, Limits, Schedule, Session
+from goalgan_bt.runs.session import Limits, Schedule, Session, checked
 from goalgan_bt.runs.signals import Stop
 from goalgan_bt.runs.torchrun import refuse_company
 
@@ -272,7 +272,7 @@ def resume(agent: Any, recall: Any, folder: Path) -> tuple[dict[str, Any], float
         raise RunError(f"{folder} has reached its limits: there is nothing left to do")
     with checkpoint.saved(folder) as state:
         restore(agent, recall, state)
-        run, mean = {name: state["run"][name] for name in STATE}, float(state["return"])
+        run, mean = checked(state["run"]), float(state["return"])
         counts = run["iteration"], run["seconds"], run["next_measurement"], *run["steps"].values()
         if not math.isfinite(sum(counts) + mean):
             raise ValueError("what was measured is not finite")

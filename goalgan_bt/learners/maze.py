@@ -455,7 +455,7 @@ def measure(
             checked = consistency(test_env, traces)
         run.count("eval", steps + checked.steps)
         both = {"coverage": float(measured.mean()), "coverage_deterministic": by_mean.mean()}
-        run.note("eval", both)
+        run.note("eval", both | {"floor": still(test_env)})
         run.note("backtracking", checked.metrics())
     with run.clock.measure("learning"):
         run.background.wait("gan")
@@ -463,6 +463,13 @@ def measure(
             run.background.wait("value")
         ranks.agree(learner.tensors())
     return measured
+
+
+def still(env: GoalEnv) -> float:
+    """The coverage of a body that does not move from where episodes begin."""
+    goals = env.test_goals()
+    start = env.achieved_goals(env.start_state[None])
+    return float(env.reached(np.repeat(start, len(goals), axis=0), goals).mean())
 
 
 def report(

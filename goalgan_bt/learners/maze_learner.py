@@ -22,7 +22,7 @@ from goalgan_bt.recall.places import Places
 from goalgan_bt.recall.transitions import Transitions
 from goalgan_bt.runs import checkpoint, ranks
 from goalgan_bt.runs.errors import RunError
-from goalgan_bt.runs.session import STATE
+from goalgan_bt.runs.session import checked
 from goalgan_bt.runs.sound import finite
 
 NOISY = ("rollout", "evaluation", "trpo", "value", "gan", "backtracking", "imitation")
@@ -189,9 +189,11 @@ def load(learner: MazeLearner, folder: Path, collector: Collector | None = None)
     """
     with checkpoint.saved(folder) as state:
         learner.load_state_dict(state["learner"])
+        if broken := learner.broken():
+            raise ValueError(f"a weight of the {broken} is not finite")
         if collector is not None:
             collector.load_state_dict(state["collector"])
-        run = {name: state["run"][name] for name in STATE}
+        run = checked(state["run"])
     return run
 
 

@@ -30,8 +30,6 @@ from goalgan_bt.runs.signals import Stop
 from goalgan_bt.runs.terminal import Terminal, complain
 from goalgan_bt.runs.tracking import Tracker
 
-# What a run needs to go on, besides what it has learned (`Session.state_dict`).
-STATE = "iteration", "steps", "seconds", "next_measurement", "metrics"
 # Settings on which no result depends.
 HARMLESS = frozenset(
     ("resume", "viz", "viz_host", "viz_port", "track", "out", "threads", "report_every")
@@ -70,7 +68,7 @@ class Session:
         settings: all of them, to be written into it.
         limits, schedule: when it ends, when it measures.
         title: of the live table; None shows nothing on the terminal.
-        state: what `state_dict` gave, to go on from there.
+        state: what `state_dict` gave, to go on from there (see `checked`).
         stop: asked at the end of every iteration whether to end early.
         agreed: makes a number the same on all ranks.
         events: whether TensorBoard gets the metrics too.
@@ -110,9 +108,8 @@ class Session:
         self.background = Background()
         if state is not None:
             self.background.metrics |= state["metrics"]
-            self.iteration, self._next = int(state["iteration"]), float(state["next_measurement"])
-            self.steps = {name: int(state["steps"][name]) for name in self.steps}
-            seconds = float(state["seconds"])
+            self.iteration, self._next = state["iteration"], state["next_measurement"]
+            self.steps, seconds = dict(state["steps"]), state["seconds"]
         self.clock = Clock(seconds)
         if state is not None and self._done() >= 1:
             raise RunError(
@@ -282,6 +279,27 @@ class Session:
             self._tracker.close()
         if self.folder is not None and isinstance(error, OSError) and not self.folder.exists():
             raise RunError(f"the run folder {self.folder} has vanished: start again") from None
+
+
+def checked(state: Mapping[str, Any]) -> dict[str, Any]:
+    """What `Session.state_dict` gave, read from a file.
+
+    Raises:
+        KeyError, TypeError, ValueError, OverflowError: if it is none.
+    """
+    iteration, steps = int(state["iteration"]), dict[str, int]()
+    for name in ("train", "label", "eval"):
+        steps[name] = int(state["steps"][name])
+    seconds, following = float(state["seconds"]), float(state["next_measurement"])
+    if not all(0 <= n < math.inf for n in (iteration, seconds, following, *steps.values())):
+        raise ValueError("what it says of the run's time cannot be")
+    return {
+        "iteration": iteration,
+        "steps": steps,
+        "seconds": seconds,
+        "next_measurement": following,
+        "metrics": {str(name): float(value) for name, value in state["metrics"].items()},
+    }
 
 
 def changed(folder: Path, settings: Mapping[str, Any]) -> list[str]:
