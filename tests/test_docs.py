@@ -26,6 +26,8 @@ SETUP = (
     "export ",
     "uv pip",
     "sed -i",
+    "pip-licenses",
+    "cyclonedx-py",
 )  # and no command of ours
 SMALL = (
     "--iterations 1 --rollout.num-envs 8 --rollout.steps 5 --coverage.rollouts 1 --gan.steps 2 "
