@@ -3,8 +3,10 @@
 import contextlib
 import os
 import pty
+import shutil
 import signal
 import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -371,6 +373,33 @@ def test_a_full_disk_is_one_line_and_the_last_checkpoint_is_whole(small_disk):
     resumed = run("--resume", folder, "--iterations", saved + 1, out=small_disk)
     assert resumed.returncode == 0, resumed.stderr
     assert not list(folder.glob("*.part"))
+
+
+@pytest.mark.skipif(shutil.which("setpriv") is None, reason="needs setpriv")
+def test_a_folder_that_becomes_read_only_is_one_line(tmp_path):
+    """Also for root, who else may write anywhere."""
+    words = [sys.executable, "-m", "goalgan_bt.train", "--env", "point_umaze", "--out", tmp_path]
+    words += words_of("--env", "point_umaze", out=tmp_path)
+    plain = ["setpriv", "--bounding-set=-dac_override", "--", *map(str, words)]
+    process = subprocess.Popen(plain, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        folder = Path(process.stdout.readline().removeprefix("run folder: ").strip())
+        while not (folder / "checkpoint.pt").exists():
+            assert process.poll() is None
+            time.sleep(0.05)
+        for place in (folder, folder / "frames"):
+            place.chmod(0o555)
+        _, errors = process.communicate(timeout=100)
+    finally:
+        process.kill()
+        for place in (folder, folder / "frames"):
+            place.chmod(0o755)
+    assert process.returncode == 2
+    (line,) = errors.strip().splitlines()
+    assert "Permission denied" in line and f"--resume {folder}" in line
+    saved = checkpoint.read(folder / "checkpoint.pt")["run"]["iteration"]
+    resumed = run("--resume", folder, "--iterations", saved + 1, out=tmp_path)
+    assert resumed.returncode == 0, resumed.stderr
 
 
 def test_help_shows_defaults_of_the_preset():

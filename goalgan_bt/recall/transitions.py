@@ -86,7 +86,7 @@ class Transitions:
         Raises:
             ValueError: if that is no ring.
         """
-        cursor, added, learned = state["counts"].tolist()
+        cursor, added, learned = map(int, state["counts"])
         rows = [state[name].numpy() for name in self.COLUMNS]
         n = len(rows[0])
         if not (0 <= cursor <= n and n <= added >= learned >= 0):
