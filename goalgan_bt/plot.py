@@ -16,6 +16,7 @@ import tyro
 
 from goalgan_bt.runs.command_line import check_ranges, parse, run_command
 from goalgan_bt.runs.errors import RunError, UsageError
+from goalgan_bt.runs.files import write_atomically
 from goalgan_bt.runs.ranges import ABOVE_ZERO, between
 from goalgan_bt.runs.terminal import say
 
@@ -58,7 +59,9 @@ def work(argv: list[str] | None) -> None:
     except ImportError:
         raise RunError('plots need matplotlib: pip install "goalgan_bt[plots]"') from None
     path = cfg.out or cfg.runs[0] / "curves.png"
-    pictures.overview(list(cfg.runs), cfg.maps, cfg.at).savefig(path, dpi=150)
+    figure = pictures.overview(list(cfg.runs), cfg.maps, cfg.at)
+    # The folder may be somebody else's: a link that lies there must not lead what is written away.
+    write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=150))
     say(str(path))
 
 

@@ -1,10 +1,12 @@
 import json
+import re
 from dataclasses import asdict
 
 import pytest
 
 from goalgan_bt import envs
 from goalgan_bt.learners import maze_config, table
+from goalgan_bt.runs.command_line import whole_numbers
 from goalgan_bt.runs.errors import RunError, UsageError
 from goalgan_bt.runs.run_folder import write_settings
 
@@ -28,7 +30,7 @@ def test_the_command_line_overrides_the_preset(env):
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--env", "ant_nowhere"], "unknown environment 'ant_nowhere': choose one of"),
+        (["--env", "ant_nowhere"], "unknown environment 'ant_nowhere': "),
         (["--total-steps", "-5"], "--total-steps must be greater than 0, not -5"),
         (["--trpo.max-kl", "0"], "--trpo.max-kl must be greater than 0"),
         (["--discount", "1.5"], "--discount must be between 0 and 1"),
@@ -37,7 +39,7 @@ def test_the_command_line_overrides_the_preset(env):
         (["--goals.r-min", "0.9"], "--goals.r-min must be less"),
         (["--no-such-flag", "1"], "no-such-flag"),
         (["--seed", "three"], "--seed cannot be 'three'; --help tells what it takes"),
-        (["--total-steps", "1e5"], "--total-steps cannot be '1e5'; --help tells what it takes"),
+        (["--total-steps", "1.5e0"], "--total-steps cannot be '1.5e0'; --help tells what it takes"),
         (["--dim", "3"], "--dim goes with point_nd: ant_umaze has two dimensions"),
         (["--resume", "nowhere"], "nowhere is no run"),
         (["--policy.final-std", "0"], "--policy.final-std must be greater than 0"),
@@ -113,3 +115,37 @@ def test_help_explains_every_setting(capsys):
         flags = value if isinstance(value, dict) else {"": None}
         for flag in flags:
             assert "--" + ".".join(filter(None, [name, flag])).replace("_", "-") in text
+
+
+def test_large_numbers_may_be_written_with_an_exponent():
+    cfg = table.from_command_line(["--env", "point_umaze", "--total-steps", "1e6", "--seed=2e1"])
+    assert cfg.total_steps == 1_000_000 and cfg.seed == 20
+    words = "--env point_umaze --trpo.max-kl 1e-2 --total-steps 2.5E+6"
+    cfg = table.from_command_line(words.split())
+    assert cfg.trpo.max_kl == 0.01 and cfg.total_steps == 2_500_000
+    assert whole_numbers(["1e6", "--out", "a", "1e3", "--x", "1.55e1"]) == [
+        "1e6",
+        "--out",
+        "a",
+        "1e3",
+        "--x",
+        "1.55e1",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("env", "meant"),
+    [
+        ("umaze", "did you mean point_umaze or ant_umaze?"),
+        ("hoper", "did you mean hopper?"),
+        ("four_rooms_99999", "four_rooms_N (N from 7 to 51)"),
+    ],
+)
+def test_an_unknown_environment_is_told_what_may_be_meant(env, meant):
+    with pytest.raises(UsageError, match=re.escape(meant)):
+        table.from_command_line(["--env", env])
+
+
+def test_a_folder_of_runs_names_one_of_them(trained):
+    with pytest.raises(RunError, match=f"it holds 1 runs, of which {trained} is the last"):
+        table.load(trained.parent)

@@ -105,3 +105,9 @@ def test_slide_along_a_wall_keeps_the_free_axis():
     after, stopped = UMAZE.slide(before, before + np.array([0.5, 0.3]), radius=0.1)
     assert after[0] == pytest.approx([0.5, 0.9])
     assert stopped.tolist() == [[False, True]]
+
+
+def test_a_map_may_begin_with_a_byte_order_mark(tmp_path):
+    path = tmp_path / "map.txt"
+    path.write_text("####\n#S.#\n####\n", encoding="utf-8-sig")
+    assert mazes.load(path).rows == ("####", "#S.#", "####")

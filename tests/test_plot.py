@@ -1,3 +1,4 @@
+import json
 import shutil
 
 import matplotlib.image
@@ -6,6 +7,8 @@ from conftest import call, run_module
 
 from goalgan_bt.runs.frames import frame_paths
 from goalgan_bt.viz import pictures
+from goalgan_bt.viz.pictures import _title
+from goalgan_bt.viz.run import Run
 
 
 def plot(*arguments):
@@ -30,16 +33,24 @@ def test_the_maps_tiles_fill_the_free_cells(folder):
 
 
 def test_maps_of_chosen_iterations(folder, tmp_path):
-    assert [f.stem for f in pictures.frames_at(folder, (3, 2, 90))] == [
-        "000003",
-        "000002",
-        "000004",
-    ]
+    (folder / "frames/000003.npz").unlink()  # reports may be every few iterations
+    chosen = [f.stem for f in pictures.frames_at(folder, (3, 2, 4))]
+    assert chosen == ["000002", "000002", "000004"]
     titles = [ax.get_title() for ax in pictures.overview([folder], at=(2, 4)).axes]
     assert titles[0].startswith("iteration 2: ") and titles[1].startswith("iteration 4: ")
     done = plot(folder, "--at", 1, 2, "--out", tmp_path / "c.png")
     assert done.returncode == 0, done.stderr
     assert plot(folder, "--at", 0).returncode == 2
+    done = plot(folder, "--at", 99999)
+    assert done.returncode == 2 and "has no report of iteration 99999: its last is 4" in done.stderr
+
+
+def test_a_run_in_a_map_of_its_own_is_called_by_it(folder):
+    settings = json.loads((folder / "config.json").read_text())
+    assert _title(Run(folder)) == "point_umaze recall_traces s0"
+    (folder / "config.json").write_text(json.dumps(settings | {"map": "/somewhere/my_$maze.txt"}))
+    assert _title(Run(folder)) == r"point_my_\$maze recall_traces s0"
+    assert plot(folder).returncode == 0
 
 
 def test_runs_of_any_name_can_be_drawn(folder, tmp_path):

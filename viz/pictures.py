@@ -82,9 +82,10 @@ def last_of(rows: list[dict[str, str]], name: str) -> list[float]:
 
 
 def _title(run: Run) -> str:
-    """What tells a run from others, in three words."""
-    known = [run.settings.get(name) for name in ("env", "method", "seed")]
-    return run.name if None in known else "{} {} s{}".format(*known)
+    """What tells a run from others, in three words; matplotlib reads formulas between dollars."""
+    known = [run.settings.get(name) for name in ("method", "seed")]
+    title = run.name if None in known else "{} {} s{}".format(run.task, *known)
+    return title.replace("$", r"\$")
 
 
 def coverage_map(ax: Axes, folder: Path, frame: Path, goals: float = 7.0) -> Any:
@@ -143,8 +144,14 @@ def measured_frames(folder: Path) -> list[Path]:
 
 
 def frames_at(folder: Path, iterations: tuple[int, ...]) -> list[Path]:
-    """The frames nearest to those iterations, measured or not."""
+    """The frames nearest to those iterations, measured or not.
+
+    Raises:
+        RunError: for iterations that the run has not come to.
+    """
     frames = frame_paths(folder)
+    if frames and max(iterations, default=0) > (last := int(frames[-1].stem)):
+        raise RunError(f"{folder} has no report of iteration {max(iterations)}: its last is {last}")
     return [min(frames, key=lambda frame: abs(int(frame.stem) - i)) for i in iterations if frames]
 
 

@@ -32,6 +32,7 @@ class Run:
 
     Attributes:
         name, env, maze: from the folder; maze is None where there are no walls.
+        task: what is learned: env, or the body and its own map.
         settings: the resolved settings as nested dictionaries.
         iterations: of the frames there are, ascending.
         metrics: what `metrics.csv` holds.
@@ -47,6 +48,9 @@ class Run:
         try:
             settings = json.loads(read_own(folder / "config.json", run_folder.SMALL))
             self.env, self.settings = str(settings["env"]), dict(settings)
+            own_map = settings.get("map")
+            body = self.env.rpartition(":")[2].split("_")[0].lower()
+            self.task = self.env if own_map is None else f"{body}_{Path(str(own_map)).stem}"
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             raise RunError(f"{folder} is no run: it has no readable config.json") from None
         self.iterations: list[int] = []

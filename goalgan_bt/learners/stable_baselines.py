@@ -34,6 +34,7 @@ from goalgan_bt.recall.settings import BacktrackingConfig, RecallConfig
 from goalgan_bt.recall.traces import recall_traces
 from goalgan_bt.runs import checkpoint
 from goalgan_bt.runs.signals import Stop
+from goalgan_bt.runs.terminal import say
 
 MOST = 5.0  # standard deviations from the mean at which a number of an observation is cut off
 FAR = 3.0  # root mean square of the standard deviations from what was seen at which a trace ends
@@ -124,6 +125,7 @@ class RecallTraces(BaseCallback):
         self._paths: list[list[tuple[Any, Any, float]]] = []
         self._whole = np.empty(0, dtype=bool)
         self._loaded = False  # and not gone on with yet
+        self._waited = False  # for episodes to learn from, which is told once
         self.last: dict[str, float] = {}
         self.seconds = 0.0
 
@@ -280,6 +282,12 @@ class RecallTraces(BaseCallback):
         chosen, threshold = self.best()
         total = sum(len(one.rewards) for one in chosen)
         if total < self.cfg.min_steps:
+            if not self._waited:
+                say(
+                    f"RecallTraces waits: {total} of {self.cfg.min_steps} steps of episodes that "
+                    "are better than others"
+                )
+            self._waited = True
             return {}
         states, following = (
             self._normalised(np.concatenate([one.obs[rows] for one in chosen]))

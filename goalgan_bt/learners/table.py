@@ -2,10 +2,12 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from goalgan_bt import envs
+from goalgan_bt.envs.four_rooms import SIZES
 from goalgan_bt.envs.goal_env import GoalEnv
 from goalgan_bt.learners import four_rooms, locomotion, maze_config
 from goalgan_bt.learners.run_config import RunConfig
@@ -55,7 +57,7 @@ LEARNERS = (
     Learner(
         "goalgan_bt.learners.four_rooms",
         four_rooms.FourRoomsConfig,
-        ("four_rooms_N",),
+        (f"four_rooms_N (N from {SIZES[0]} to {SIZES[-1]})",),
         four_rooms.knows,
         four_rooms.preset,
         four_rooms.check,
@@ -111,8 +113,10 @@ def learner_of(env: str) -> Learner:
                 return learner
     except envs.own.OwnEnvError as error:
         raise UsageError(str(error)) from error.__cause__
-    names = ", ".join(name for learner in LEARNERS for name in learner.names)
-    raise UsageError(f"unknown environment {env!r}: choose one of {names}")
+    names = [name for learner in LEARNERS for name in learner.names]
+    near = [name for name in names if env and env in name] or get_close_matches(env, names, 2)
+    meant = f"did you mean {' or '.join(near)}? Otherwise " if near else ""
+    raise UsageError(f"unknown environment {env!r}: {meant}choose one of {', '.join(names)}")
 
 
 def check(cfg: RunConfig) -> None:

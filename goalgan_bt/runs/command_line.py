@@ -24,6 +24,7 @@ from goalgan_bt.runs.signals import SIGNALS
 from goalgan_bt.runs.terminal import complain
 
 T = TypeVar("T")
+FLOATING = re.compile(r"\d+(\.\d+)?[eE]\+?\d{1,2}")
 NO_MEMORY = "out of memory: use smaller settings, for example fewer simulations or smaller networks"
 
 
@@ -40,7 +41,7 @@ def parse(kind: type[T], argv: list[str] | None, prog: str, default: T | None = 
         UsageError: for an unknown flag or a bad value.
         SystemExit: after `--help`.
     """
-    printed = io.StringIO()
+    printed, argv = io.StringIO(), whole_numbers(sys.argv[1:] if argv is None else argv)
     defaults: dict[str, Any] = {} if default is None else {"default": default}
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
@@ -50,6 +51,18 @@ def parse(kind: type[T], argv: list[str] | None, prog: str, default: T | None = 
             sys.stdout.write(printed.getvalue())
             raise
         raise UsageError(_one_line(printed.getvalue())) from None
+
+
+def whole_numbers(argv: list[str]) -> list[str]:
+    """The same with whole numbers in digits that were given to flags as 1e6 or 2.5e6."""
+    told = []
+    for before, word in pairwise(["", *argv]):
+        flag, equals, number = word.rpartition("=") if word.startswith("--") else ("", "", word)
+        given = equals or before.startswith("--")
+        if given and FLOATING.fullmatch(number) and float(number).is_integer():
+            word = f"{flag}{equals}{int(float(number))}"
+        told.append(word)
+    return told
 
 
 def check_ranges(settings: Any) -> None:

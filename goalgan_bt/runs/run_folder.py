@@ -153,9 +153,15 @@ def read_settings(kind: type[T], folder: Path) -> T:
     try:
         return _build(kind, json.loads(read_own(path, SMALL)))
     except FileNotFoundError:
-        raise RunError(f"{folder} is no run: it has no config.json") from None
+        raise RunError(f"{folder} is no run: it has no config.json{inside(folder)}") from None
     except (OSError, ValueError, TypeError) as error:
         raise RunError(f"cannot read {path}: {error}") from None
+
+
+def inside(folder: Path) -> str:
+    """What a message adds where a folder of runs was named in a run's place."""
+    runs = sorted(path.parent for path in folder.glob("*/config.json"))
+    return f"; it holds {len(runs)} runs, of which {runs[-1]} is the last by name" if runs else ""
 
 
 def settings_of(folder: Path) -> dict[str, Any]:
@@ -222,7 +228,7 @@ def read_meta(folder: Path) -> dict[str, Any]:
     try:
         meta: dict[str, Any] = json.loads(read_own(folder / "meta.json", SMALL))
     except FileNotFoundError:
-        raise RunError(f"{folder} is no run: it has no meta.json") from None
+        raise RunError(f"{folder} is no run: it has no meta.json{inside(folder)}") from None
     except (OSError, ValueError) as error:
         raise RunError(f"cannot read {folder / 'meta.json'}: {error}") from None
     if not isinstance(meta, dict) or "commit" not in meta:

@@ -89,6 +89,8 @@ class Stop:
         if self.requested:
             raise KeyboardInterrupt(number)
         self.signal = number
+        if sys.stderr.isatty():  # a person, who should not wonder
+            os.write(2, b"\nstopping after this iteration; once more stops at once\n")
 
 
 def exit_with(code: int) -> NoReturn:
