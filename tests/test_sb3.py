@@ -19,6 +19,7 @@ from stable_baselines3.common.logger import configure  # noqa: E402
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize  # noqa: E402
 
 from goalgan_bt.learners import stable_baselines  # noqa: E402
+from goalgan_bt.learners.gaussian_agent import Rows  # noqa: E402
 from goalgan_bt.learners.stable_baselines import RecallTraces, Seen, Trajectory  # noqa: E402
 from goalgan_bt.recall.settings import RecallConfig  # noqa: E402
 from goalgan_bt.runs import checkpoint  # noqa: E402
@@ -235,6 +236,61 @@ def test_saved_and_loaded_it_goes_on_as_if_it_had_not_been(name, model, tmp_path
     assert first.last and first.last == second.last
     assert all(torch.equal(one[key], two[key]) for key in one)
     assert first._rng.random() == second._rng.random()
+
+
+class ReachGoal(Reach):
+    """The same with a goal beside it, in a dictionary."""
+
+    def __init__(self):
+        super().__init__()
+        parts = ("observation", 2), ("desired_goal", 1), ("achieved_goal", 2)
+        self.observation_space = spaces.Dict(
+            {name: spaces.Box(-2, 2, (n,), np.float32) for name, n in parts}
+        )
+
+    def told(self, obs):
+        goal = np.zeros(1, np.float32)
+        return {"observation": obs, "desired_goal": goal, "achieved_goal": 2 * obs}
+
+    def reset(self, **how):
+        return self.told(super().reset(**how)[0]), {}
+
+    def step(self, action):
+        obs, *rest = super().step(action)
+        return self.told(obs), *rest
+
+
+@pytest.mark.parametrize("normalised", [False, True])
+@pytest.mark.parametrize("name", ["SAC", "PPO"])
+def test_observations_may_be_dictionaries(name, normalised):
+    env = make_vec_env(ReachGoal, n_envs=1, seed=0)
+    if normalised:
+        env = VecNormalize(env)
+    small = {"learning_starts": 100} if name == "SAC" else {"n_steps": 128, "batch_size": 64}
+    learner = AGENTS[name]("MultiInputPolicy", env, seed=0, device="cpu", **small)
+    callback = RecallTraces(RecallConfig(trace_length=5, min_steps=20, every=128))
+    learner.learn(640, callback=callback)
+    first = callback.trajectories[0].obs
+    assert first.shape == (31, 5)  # by name: achieved_goal, desired_goal, observation
+    assert first[:, :2] == pytest.approx(2 * first[:, 3:], abs=1e-5) and not first[:, 2].any()
+    assert np.isfinite(callback.last["loss"]) and callback.last["valid"] > 0.5
+
+
+def test_rows_go_back_to_what_they_were():
+    rows = Rows(ReachGoal().observation_space)
+    obs = {"observation": np.ones((3, 2)), "desired_goal": np.zeros((3, 1))}
+    obs["achieved_goal"] = np.full((3, 2), 5.0)
+    assert rows.size == 5 and rows.of(obs)[0].tolist() == [5, 5, 0, 1, 1]
+    back = rows.back(rows.of(obs))
+    assert all(np.array_equal(back[name], obs[name]) for name in obs)
+    with pytest.raises(TypeError, match="observations that are vectors"):
+        Rows(spaces.Dict({"a": spaces.Box(0, 1, (2, 2)), "b": spaces.Box(0, 1, (2,))}))
+
+
+def test_it_says_once_what_it_waits_for(capsys):
+    learner = agent("PPO", make_vec_env(Reach, seed=0), n_steps=64)
+    learner.learn(400, callback=RecallTraces(RecallConfig(min_steps=500, every=64)))
+    assert capsys.readouterr().out.count("RecallTraces waits: ") == 1
 
 
 def test_what_was_saved_for_another_task_is_refused(tmp_path):

@@ -24,16 +24,56 @@ KL_SAMPLE = 1024  # states on which the KL of an imitation is bounded
 HALVINGS = 10  # of a step that is too long: for a policy as narrow as SAC's nearly each is
 
 
+class Rows:
+    """Observations as rows of numbers: vectors as they are, those of a dictionary, such as an
+    observation and a goal, one after the other by name.
+
+    Args:
+        space: of the observations.
+
+    Attributes:
+        size: numbers of a row.
+
+    Raises:
+        TypeError: if they are no vectors.
+    """
+
+    def __init__(self, space: spaces.Space[Any]) -> None:
+        parts = {**space.spaces} if isinstance(space, spaces.Dict) else {"": space}
+        self._names = sorted(parts) if isinstance(space, spaces.Dict) else []
+        for part in parts.values():
+            if not (isinstance(part, spaces.Box) and len(part.shape) == 1):
+                raise TypeError(f"RecallTraces needs observations that are vectors, not {space}")
+        sizes = [cast(Any, parts[name]).shape[0] for name in sorted(parts)]
+        self._ends = np.cumsum(sizes)
+        self.size = int(self._ends[-1])
+
+    def of(self, obs: Any) -> FloatArray:
+        """Observations as rows, (..., size)."""
+        if not self._names:
+            return np.array(obs)
+        return np.concatenate([np.asarray(obs[name]) for name in self._names], axis=-1)
+
+    def back(self, rows: Any) -> Any:
+        """Rows, (n, size), array or tensor, as observations."""
+        if not self._names:
+            return rows
+        begins = [0, *self._ends[:-1]]
+        bounds = zip(self._names, begins, self._ends, strict=True)
+        return {name: rows[:, begin:end] for name, begin, end in bounds}
+
+
 class GaussianAgent:
-    """What recall needs of an agent. Observations are as the agent sees them; actions are in
-    [-1, 1] over their range.
+    """What recall needs of an agent. Observations are as the agent sees them, as rows; actions are
+    in [-1, 1] over their range.
 
     Args:
         model: the agent.
 
     Attributes:
         model: the agent; actor: the network that acts; squashed: whether a tanh squashes what the
-            Gaussian says; sizes: numbers of an observation and of an action.
+            Gaussian says; rows: how observations become such; sizes: numbers of an observation and
+            of an action.
 
     Raises:
         TypeError: if its policy is no Gaussian (without memory or state-dependent exploration), or
@@ -49,8 +89,7 @@ class GaussianAgent:
                 "RecallTraces needs an agent with a Gaussian policy, without memory or "
                 "state-dependent exploration: SAC, TRPO, PPO or A2C"
             )
-        if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
-            raise TypeError(f"RecallTraces needs observations that are vectors, not {space}")
+        self.rows = Rows(space)
         if not (isinstance(actions, spaces.Box) and len(actions.shape) == 1):
             raise TypeError(f"RecallTraces needs actions that are vectors of numbers: {actions}")
         if not (actions.high > actions.low).all():
@@ -58,7 +97,7 @@ class GaussianAgent:
         self.model = model
         self.squashed = isinstance(policy, SACPolicy)
         self.actor: Any = policy.actor if self.squashed else policy
-        self.sizes = space.shape[0], actions.shape[0]
+        self.sizes = self.rows.size, actions.shape[0]
         self._low, self._high = actions.low.astype(float), actions.high.astype(float)
 
     def in_unit(self, actions: FloatArray) -> FloatArray:
@@ -68,9 +107,9 @@ class GaussianAgent:
     def gaussian(self, obs: Tensor) -> Normal:
         """The policy at observations (n, obs_dim), before it is squashed or clipped."""
         if self.squashed:
-            mean, log_std, _ = self.actor.get_action_dist_params(obs)
+            mean, log_std, _ = self.actor.get_action_dist_params(self.rows.back(obs))
             return Normal(mean, log_std.exp())
-        found = self.actor.get_distribution(obs).distribution
+        found = self.actor.get_distribution(self.rows.back(obs)).distribution
         assert isinstance(found, Normal)
         return found
 
@@ -85,7 +124,7 @@ class GaussianAgent:
     @torch.no_grad()
     def values(self, obs: FloatArray) -> FloatArray:
         """What the critic says of observations (n, obs_dim), (n,)."""
-        told, policy = self.tensor(obs), cast(Any, self.model.policy)
+        told, policy = self.rows.back(self.tensor(obs)), cast(Any, self.model.policy)
         if self.squashed:
             judged = policy.critic(told, policy.actor(told, deterministic=True))
             return torch.cat(judged, dim=1).amin(dim=1).cpu().numpy()

@@ -171,7 +171,7 @@ class RecallTraces(BaseCallback):
     def _on_training_start(self) -> None:
         self._normalising = self.model.get_vec_normalize_env()
         begin, anew = self._original(self.model._last_obs), self.locals["reset_num_timesteps"]
-        expected = self.model.observation_space.shape
+        expected = self._acting.sizes[:1]
         if begin.shape[1:] != expected:
             raise TypeError(
                 f"RecallTraces cannot see the observations {expected} of the agent before they are "
@@ -195,13 +195,14 @@ class RecallTraces(BaseCallback):
         """The last observations as the environments gave them: what an agent that normalises has
         seen would look different by the time that it is recalled."""
         known = obs if self._normalising is None else self._normalising.get_original_obs()
-        return np.array(known)
+        return self._acting.rows.of(known)
 
     def _normalised(self, obs: FloatArray) -> FloatArray:
         """Observations (n, obs_dim) as the agent sees them at present."""
         if self._normalising is None:
             return obs
-        return np.asarray(self._normalising.normalize_obs(obs))
+        rows = self._acting.rows
+        return rows.of(self._normalising.normalize_obs(rows.back(obs)))
 
     def _on_step(self) -> bool:
         begin = time.perf_counter()
@@ -220,6 +221,7 @@ class RecallTraces(BaseCallback):
                 last, timeout = info["terminal_observation"], info.get("TimeLimit.truncated", False)
                 if normalising is not None:
                     last = normalising.unnormalize_obs(last)
+                last = self._acting.rows.of(last)
                 obs, actions, rewards_of = map(np.array, zip(*path, strict=True))
                 whole = np.concatenate([obs, last[None]])
                 self.remember(Trajectory(whole, actions, rewards_of, not timeout))
