@@ -1,9 +1,11 @@
 """The page: what it reads, what it draws, what people can do to it."""
 
+import gzip
 import json
 import shutil
 import socket
 import time
+import urllib.request
 
 import msgspec
 import numpy as np
@@ -23,7 +25,7 @@ from goalgan_bt.runs.frames import read_frame
 from goalgan_bt.runs.metrics_csv import Metrics
 from goalgan_bt.runs.run_writer import RunWriter
 from goalgan_bt.study.published import published
-from goalgan_bt.viz.captions import settings_table
+from goalgan_bt.viz.captions import settings_table, state
 from goalgan_bt.viz.curves import joined, thinned
 from goalgan_bt.viz.download import as_csv
 from goalgan_bt.viz.player import Player
@@ -337,6 +339,41 @@ def test_a_click_leads_to_an_attempt_with_an_outcome(view):
     assert "Goal (0.2, 0.0): **reached** after" in view._outcome.content
 
 
+def test_ring_and_verdict_stay_until_the_body_goes_elsewhere(view):
+    view._ask("goal", np.array([0.2, 0.0]))
+    now = time.monotonic()
+    view.tick(now)
+    attempt = view._attempt
+    view._play_body(now + attempt.seconds + 20)
+    assert view._attempt is attempt and "**reached** after" in view._outcome.content
+    view._play_body(now + attempt.seconds + 40)
+    assert view._attempt is not attempt and "of its own again" in view._outcome.content
+
+
+def test_an_old_report_says_whose_body_it_is(view):
+    view._show(0)
+    assert "the newest policy" in view._caption.content
+    view._show(3)
+    assert "newest policy" not in view._caption.content
+
+
+def test_the_status_says_when_coverage_was_measured(folder):
+    coverage = Run(folder).metrics.column("eval/coverage")[-1]
+    steps = Run(folder).metrics.column("steps/train")[-1]
+    assert f"coverage {coverage:.2f} at {steps / 1e6:.2f}M" in state(Run(folder))
+
+
+@pytest.mark.parametrize("encoding", ["gzip", "identity"])
+def test_the_page_is_called_by_its_run(view, encoding):
+    address = f"http://127.0.0.1:{view.server.get_port()}/"
+    request = urllib.request.Request(address, headers={"Accept-Encoding": encoding})
+    with urllib.request.urlopen(request, timeout=10) as answer:
+        assert answer.headers["Content-Encoding"] == encoding
+        body = answer.read()
+    page = gzip.decompress(body) if encoding == "gzip" else body
+    assert f"<title>{view.runs[0].name}</title>" in page.decode()
+
+
 def test_arrows_by_hand():
     there, along = np.array([[1.0, 2.0]]), np.array([[0.0, 1.0]])
     shaft, one, other = arrows(there, along)
@@ -375,7 +412,7 @@ def test_how_an_attempt_ended_is_told_however_late(view):
     view.tick(now)
     view._play_body(now)
     assert "on its way" in view._outcome.content
-    view._play_body(now + 1000)  # a busy machine, or nobody looked
+    view._play_body(now + view._attempt.seconds + 25)  # a busy machine, or nobody looked
     assert "Goal (0.2, 0.0): **reached** after" in view._outcome.content
 
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from goalgan_bt.runs.metrics_csv import Metrics
 from goalgan_bt.viz.run import Run, success
 
 SILENT = 120.0  # seconds without news after which a run counts as stopped
@@ -26,17 +27,25 @@ def state(run: Run) -> str:
     metrics = run.metrics
     if not len(metrics):
         return "has begun; no iteration is finished yet."
-    coverage = metrics.last("eval/coverage")
+    coverage, steps = measured(metrics)
     progress = (
         f"iteration {metrics.last('iteration'):,.0f}, "
         f"{metrics.last('steps/train') / 1e6:.2f}M steps, "
         f"{metrics.last('time/fps'):,.0f} steps/s"
-        + (f", coverage {coverage:.2f}" if coverage == coverage else "")
+        + (f", coverage {coverage:.2f} at {steps / 1e6:.2f}M" if coverage == coverage else "")
     )
     if (ended := run.ended()) is not None:
         return f"ended ({ended}): {progress}"
     learns = time.time() - metrics.changed < SILENT
     return f"{'learns' if learns else 'is silent'}: {progress}"
+
+
+def measured(metrics: Metrics) -> tuple[float, float]:
+    """The last coverage that was measured, and after how many steps; NaN if none was."""
+    known = np.flatnonzero(np.isfinite(metrics.column("eval/coverage")))
+    if not len(known):
+        return np.nan, np.nan
+    return tuple(metrics.column(name)[known[-1]] for name in ("eval/coverage", "steps/train"))
 
 
 def caption(run: Run, iteration: int) -> str:

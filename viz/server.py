@@ -1,15 +1,19 @@
 """A viser server that only its own page may talk to."""
 
 import contextlib
+import gzip
 import io
 import ipaddress
 import socket
+from html import escape
 from typing import Any
 from urllib.parse import urlsplit
 
 import viser
 import websockets.asyncio.server
 from viser import _messages
+from websockets.datastructures import Headers
+from websockets.http11 import Response
 
 MOST_VISITORS = 64  # at a time
 MOST_SENT = 2**20  # bytes of one message from a browser: clicks and the like are all
@@ -37,7 +41,21 @@ def of_this_machine(asked: str | None) -> bool:
         return False
 
 
-def start_server(host: str, port: int) -> viser.ViserServer:
+def titled(response: Any, title: str) -> Any:
+    """A response of viser's; its page with another title, since several may be open."""
+    if response is None or not response.headers.get("Content-Type", "").startswith("text/html"):
+        return response
+    zipped = response.headers.get("Content-Encoding") == "gzip"
+    body = gzip.decompress(response.body) if zipped else response.body
+    body = body.replace(b"<title>Viser</title>", f"<title>{escape(title)}</title>".encode(), 1)
+    body = gzip.compress(body) if zipped else body
+    headers = Headers(response.headers)
+    del headers["Content-Length"]
+    headers["Content-Length"] = str(len(body))
+    return Response(response.status_code, response.reason_phrase, headers, body)
+
+
+def start_server(host: str, port: int, title: str = "goalgan_bt") -> viser.ViserServer:
     """A viser server, without its banner.
 
     viser lets a page of any other site, open in the same browser, read everything and press every
@@ -47,6 +65,7 @@ def start_server(host: str, port: int) -> viser.ViserServer:
 
     Args:
         host, port: where to listen.
+        title: what the browser calls the page.
     """
     serve = websockets.asyncio.server.serve
     alone, here = is_loopback(host), 0
@@ -63,7 +82,7 @@ def start_server(host: str, port: int) -> viser.ViserServer:
                 return connection.respond(403, "This page talks to its own site only.\n")
             if here >= MOST_VISITORS and "Upgrade" in request.headers:
                 return connection.respond(503, "Too many are looking: try again later.\n")
-            return process_request(connection, request)
+            return titled(process_request(connection, request), title)
 
         async def counted(connection: Any) -> None:
             nonlocal here

@@ -28,6 +28,7 @@ LOOK_EVERY = 1.0  # seconds between two looks at the run folders
 TICK = 1 / 25  # seconds between two pictures of the body
 RETRY = 10.0  # seconds after which a run that cannot be played is looked at again
 PAUSE = 1.0  # seconds for which a finished attempt stands still
+HOLD = 30.0  # the same for one that somebody asked for, with ring and verdict
 GAP = 1.15  # distance of two mazes side by side, in sides of one
 
 
@@ -41,7 +42,7 @@ class View:
 
     def __init__(self, runs: list[Run], host: str = "127.0.0.1", port: int = 8080) -> None:
         self.runs = runs
-        self.server = start_server(host, port)
+        self.server = start_server(host, port, ", ".join(run.name for run in runs))
         self._requests: queue.Queue[tuple[str, Any]] = queue.Queue(maxsize=100)
         boxes = [run.box() for run in runs]
         # Metres from one maze to the next, the same for all: GAP sides of the largest.
@@ -155,7 +156,9 @@ class View:
                 scene.draw(frame)
                 self._drawn[i] = frame
         self._shown = index
-        self._caption.content = caption(run, run.iterations[index])
+        old = index < last and len(self.runs) == 1
+        body = " · the body and its arrows show the newest policy" if old else ""
+        self._caption.content = caption(run, run.iterations[index]) + body
 
     def _play_time(self, now: float) -> None:
         if not self._play.value:
@@ -174,12 +177,13 @@ class View:
     def _play_body(self, now: float) -> None:
         if len(self.runs) > 1 or not (self._scenes[0].visible("body") or self._asked):
             return
-        if self._attempt is None or now - self._attempt_began > self._attempt.seconds + PAUSE:
-            if self._asked:  # the last look may have been long ago
-                self._outcome.content = self._describe_attempt(now)
-            self._asked = False
+        pause = HOLD if self._asked else PAUSE
+        if self._attempt is None or now - self._attempt_began > self._attempt.seconds + pause:
             if not self._ready():
                 return
+            if self._asked:
+                self._outcome.content = "The body goes for goals of its own again."
+            self._asked = False
             assert self._player is not None
             self._begin(self._player.some_goal())
         assert self._attempt is not None and self._bodies is not None
