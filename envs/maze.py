@@ -57,6 +57,7 @@ LAYOUTS = {
 
 
 MOST_CELLS = 10_000  # of a map: walls, coverage and ways of more take minutes and gigabytes
+MOST_TILES = 4_000  # each of which is tried some times whenever coverage is measured
 _ZERO = np.zeros(())
 
 
@@ -135,9 +136,11 @@ class Maze:
     def tiles(self, spacing: float = 0.5) -> FloatArray:
         """Centres of square tiles that cover the free cells, (K, 2), metres.
 
-        With 2 m cells and 0.5 m tiles: 16 per cell, 112 in the U-maze (Florensa et al. 2018).
+        With 2 m cells and 0.5 m tiles: 16 per cell, 112 in the U-maze (Florensa et al. 2018). In
+        mazes of which that would make more than `MOST_TILES` the tiles are larger.
         """
         n = max(1, round(self.cell_size / spacing))
+        n = max(1, min(n, int((MOST_TILES / self.free.sum()) ** 0.5)))
         offset = ((np.arange(n) + 0.5) / n - 0.5) * self.cell_size
         grid = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)
         return (self.cell_centres()[:, None] + grid).reshape(-1, 2)

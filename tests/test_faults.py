@@ -298,3 +298,16 @@ def test_shaping_is_no_success(tmp_path, monkeypatch):
     told = [float(row["rollout/reward"]) for row in rows]
     assert told == pytest.approx(won[2::2], rel=1e-4)  # of each iteration's last batch
     assert {row["eval/coverage"] for row in rows if row["eval/coverage"]} == {"0"}
+
+
+def test_measuring_takes_at_most_twice_the_steps_of_training(tmp_path, capsys):
+    """Also where somebody asks for more; and that is told."""
+    flags = "--coverage.every", "1", "--coverage.rollouts", "3", "--iterations", "40"
+    _, rows = trained(tmp_path, *flags)
+    at = [int(row["iteration"]) for row in rows if row["eval/coverage"]]
+    every = 112 * 4 * 60 // 2
+    steps = [int(rows[i - 1]["steps/train"]) for i in at]
+    assert at[0] == 2 and at[-1] == 40 and 3 < len(at) < 12
+    assert min(np.diff(steps[:-1])) >= every
+    assert int(rows[-2]["steps/eval"]) <= 2 * int(rows[-2]["steps/train"])
+    assert f"every {every:,} training steps, not every 1" in capsys.readouterr().out

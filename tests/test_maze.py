@@ -111,3 +111,13 @@ def test_a_map_may_begin_with_a_byte_order_mark(tmp_path):
     path = tmp_path / "map.txt"
     path.write_text("####\n#S.#\n####\n", encoding="utf-8-sig")
     assert mazes.load(path).rows == ("####", "#S.#", "####")
+
+
+def test_a_large_maze_has_larger_tiles():
+    """A thousand cells of four tiles, two thousand of one; each cell keeps the same number."""
+    for cells, each in ((250, 16), (444, 9), (1000, 4), (2000, 1), (5000, 1)):
+        rows = ("#" * (cells + 2), "#S" + "." * (cells - 1) + "#", "#" * (cells + 2))
+        maze = mazes.Maze(rows) if 3 * (cells + 2) <= mazes.MOST_CELLS else None
+        if maze is not None:
+            assert len(maze.tiles()) == cells * each <= max(mazes.MOST_TILES, cells)
+            assert maze.tile_side(cells * each) == pytest.approx(2 / each**0.5)

@@ -81,4 +81,5 @@ class CoverageConfig:
     rollouts: Annotated[int, ABOVE_ZERO] = 3
     """Episodes per test goal with the stochastic policy (the original: 2 point, 3 ant)."""
     every: Annotated[int, ABOVE_ZERO] = 2_000_000
-    """Training steps between two measurements; one more at the end."""
+    """Training steps between two measurements; one more at the end. More where so many would take
+    more than twice the steps of training."""

@@ -36,7 +36,7 @@ from goalgan_bt.runs.errors import InterruptedRun, UsageError
 from goalgan_bt.runs.session import Limits, Schedule, Session
 from goalgan_bt.runs.signals import Stop
 from goalgan_bt.runs.sound import finite, soundly
-from goalgan_bt.runs.terminal import complain
+from goalgan_bt.runs.terminal import complain, say
 
 TEST_ENVS = 512  # simulations side by side when coverage is measured
 ANYWHERE = 1000  # goals of the first batch, uniform in the box
@@ -172,17 +172,30 @@ def session(
 ) -> Session:
     """The run, and learner and simulations as they were where the run goes on."""
     state = None if cfg.resume is None or folder is None else load(learner, folder, collector)
+    env, every = collector.env, between_measurements(cfg, collector.env)
+    if every > cfg.coverage.every and ranks.rank() == 0:
+        say(
+            f"coverage of {len(env.test_goals())} goals is measured every {every:,} training "
+            f"steps, not every {cfg.coverage.every:,}: it takes up to {2 * every:,}"
+        )
     return Session(
         folder if ranks.rank() == 0 else None,
         asdict(cfg),
         Limits(cfg.total_steps, cfg.iterations, cfg.minutes),
         # Not in the first iteration: its line shall tell at once that all is well.
-        Schedule(lambda steps: steps + cfg.coverage.every, 2, cfg.report_every),
-        f"{collector.env.name}, seed {cfg.seed}",
+        Schedule(lambda steps: steps + every, 2, cfg.report_every),
+        f"{env.name}, seed {cfg.seed}",
         state=state,
         stop=stop,
         agreed=ranks.agreed,
     )
+
+
+def between_measurements(cfg: MazeConfig, env: GoalEnv) -> int:
+    """Training steps between two measurements of coverage: as the settings say, but so many that
+    measuring takes at most twice the steps of training."""
+    most = len(env.test_goals()) * (cfg.coverage.rollouts + 1) * env.horizon
+    return max(cfg.coverage.every, most // 2)
 
 
 def collector_of(learner: MazeLearner, env: GoalEnv) -> Collector:
