@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import tyro
 
 from goalgan_bt.runs.command_line import check_ranges, check_target, parse, run_command
+from goalgan_bt.runs.files import write_atomically
 from goalgan_bt.runs.ranges import NOT_NEGATIVE, between
 from goalgan_bt.runs.terminal import say
 
@@ -64,7 +65,8 @@ def work(argv: list[str] | None) -> None:
         found = evaluation.elsewhere(cfg.run, cfg.on, cfg.episodes, cfg.deterministic, cfg.seed)
     say(sentence(found))
     if cfg.json is not None:
-        cfg.json.write_text(json.dumps(found, indent=2) + "\n")
+        text = json.dumps(found, indent=2) + "\n"
+        write_atomically(cfg.json, lambda file: file.write(text.encode()))
         say(str(cfg.json))
 
 

@@ -23,6 +23,7 @@ import tyro
 
 from goalgan_bt.runs.command_line import parse, run_command
 from goalgan_bt.runs.errors import UsageError, require_installed
+from goalgan_bt.runs.files import read_own
 from goalgan_bt.runs.frames import frame_paths
 from goalgan_bt.runs.metrics_csv import read_metrics
 from goalgan_bt.runs.run_folder import commits, read_meta, write_settings
@@ -112,6 +113,7 @@ def write(run: Path, out: Path, name: str | None = None) -> None:
         raise UsageError(f"--out {out} is there already and not empty: choose another folder")
     from goalgan_bt.learners.table import load
     from goalgan_bt.learners.trained_policy import TrainedPolicy
+    from goalgan_bt.runs import checkpoint
 
     policy, cfg = TrainedPolicy(run), load(run)  # what does not load is not shared
     meta = public_meta(run, cfg)
@@ -120,12 +122,13 @@ def write(run: Path, out: Path, name: str | None = None) -> None:
     try:
         write_settings(out, asdict(public(cfg)))
         (out / "meta.json").write_text(json.dumps(meta, indent=2) + "\n")
-        for file in ("checkpoint.pt", "metrics.csv"):
-            shutil.copyfile(run / file, out / file)
+        with checkpoint.saved(run) as state:  # the one that was loaded, whatever lies beside it
+            checkpoint.save(state, out / "checkpoint.pt")
+        (out / "metrics.csv").write_bytes(read_own(run / "metrics.csv"))
         for frame in frame_paths(run)[-1:]:
-            if frame.stat().st_size <= SMALL:
+            if frame.lstat().st_size <= SMALL:
                 (out / "frames").mkdir()
-                shutil.copyfile(frame, out / "frames" / frame.name)
+                (out / "frames" / frame.name).write_bytes(read_own(frame))
         (out / "README.md").write_text(text, encoding="utf-8")
     except BaseException:
         shutil.rmtree(out, ignore_errors=True)

@@ -20,13 +20,13 @@ def run(script, *words):
 
 
 def test_killed_trainings_end_the_same(tmp_path):
-    done = run("kills.py", "--kills", 4, "--seed", 1, "--json", tmp_path / "kills.json")
+    done = run("kills.py", "--kills", 8, "--seed", 1, "--json", tmp_path / "kills.json")
     assert done.returncode == 0, done.stderr
     counts = json.loads((tmp_path / "kills.json").read_text())
     assert counts == {
         "runs": 4,
-        "kills": 4,
-        "while_saving": 0,
+        "kills": 8,
+        "while_saving": 4,
         "unreadable": 0,
         "lost": 0,
         "different": 0,

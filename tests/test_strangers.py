@@ -4,24 +4,28 @@ import contextlib
 import io
 import json
 import os
+import resource
 import shutil
 import socket
 import subprocess
 import sys
 import time
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from conftest import call
+from test_resume import new_folder, settings
 
-from goalgan_bt.learners import table
+from goalgan_bt.learners import maze, table
 from goalgan_bt.learners.trained_policy import TrainedPolicy
 from goalgan_bt.runs import checkpoint, files, run_folder
 from goalgan_bt.runs.errors import RunError
 from goalgan_bt.runs.frames import frame_paths, read_frame
 from goalgan_bt.runs.metrics_csv import Metrics, read_metrics
+from goalgan_bt.runs.signals import Stop
 from goalgan_bt.viz import page_process
 from goalgan_bt.viz.run import Run
 from goalgan_bt.viz.server import MOST_VISITORS, is_loopback, of_this_machine
@@ -48,6 +52,35 @@ def test_nothing_is_written_through_a_link(name, folder, tmp_path):
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
     assert "link" in done.stderr
     assert secret.read_text() == "mine\n" and (folder / name).is_symlink()
+
+
+def test_commands_do_not_write_through_a_link(folder, tmp_path):
+    secret = tmp_path / "secret"
+    secret.write_text("mine\n")
+    for name in ("curves.png", "eval.json"):
+        (folder / name).symlink_to(secret)
+    assert call("plot", folder).returncode == 0
+    done = call("evaluate", folder, "--episodes", 1, "--json", folder / "eval.json")
+    assert done.returncode == 0, done.stderr
+    assert secret.read_text() == "mine\n"
+    assert not any((folder / name).is_symlink() for name in ("curves.png", "eval.json"))
+
+
+@pytest.mark.parametrize("damage", ["a link", "cut short"])
+def test_what_is_shared_is_what_was_loaded(damage, folder, tmp_path):
+    pytest.importorskip("huggingface_hub")
+    path, secret = folder / checkpoint.NAME, tmp_path / "secret"
+    secret.write_text("mine\n")
+    data = path.read_bytes()
+    path.unlink()
+    if damage == "a link":
+        path.symlink_to(secret)
+    else:
+        path.write_bytes(data[:-1000])
+    done = call("share", folder, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert TrainedPolicy(tmp_path / "out").iteration == 2
+    assert all("mine" not in x.decode(errors="replace") for x in seen(tmp_path / "out").values())
 
 
 def test_frames_are_not_written_into_another_folder(folder, tmp_path):
@@ -100,6 +133,7 @@ def test_a_pipe_hangs_nobody(name, folder):
     with contextlib.suppress(RunError):
         Run(folder).refresh()
     done = call("plot", folder, "--out", folder / "x.png")
+    assert done.returncode == (0 if name in ("ended.txt", "checkpoint.pt") else 2)
     assert time.monotonic() - begin < 20
 
 
@@ -166,6 +200,27 @@ def test_texts_that_are_too_large_are_refused(name, size, folder):
             Run(folder)
 
 
+def test_a_table_of_gigabytes_is_not_read(folder):
+    """A file with a hole in it."""
+    with (folder / "metrics.csv").open("r+b") as file:
+        file.truncate(20 * 2**30)
+    live = Metrics(folder / "metrics.csv")
+    assert not live.refresh() and len(live) == 0
+
+
+def test_a_checkpoint_of_terabytes_is_refused_at_once(folder):
+    path = folder / checkpoint.NAME
+    data = path.read_bytes()
+    with path.open("r+b") as file:
+        file.truncate(2**40)
+        file.seek(0, 2)
+        file.write(data[-checkpoint.SEALED :])
+    begin = time.monotonic()
+    with pytest.raises(ValueError, match="more than"):
+        checkpoint.read(path)
+    assert time.monotonic() - begin < 1
+
+
 def test_a_huge_maze_is_refused_at_once(folder):
     meta = json.loads((folder / "meta.json").read_text())
     rows = ["#" * 400, "#S" + "." * 397 + "#", *["#" + "." * 398 + "#"] * 397, "#" * 400]
@@ -213,7 +268,7 @@ def test_every_flipped_bit_is_found(folder):
         data = bytearray(good)
         data[bit // 8] ^= 1 << (bit % 8)
         path.write_bytes(data)
-        with pytest.raises(ValueError, match=r"damaged|older|format"):
+        with pytest.raises(ValueError, match=r"damaged|format"):
             checkpoint.read(path)
 
 
@@ -227,6 +282,100 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(folder, capsys
     done = call("train", "--resume", folder, "--iterations", 6, "--viz", "none")
     assert done.returncode == 0
     assert [int(row["iteration"]) for row in read_metrics(folder)[1]] == list(range(1, 7))
+
+
+@pytest.mark.parametrize("newest", ["sound", "damaged"])
+def test_a_save_that_fails_leaves_both_checkpoints_as_they_were(newest, folder):
+    """What is damaged never takes the place of the one before it."""
+    path = folder / checkpoint.NAME
+    if newest == "damaged":
+        path.write_bytes(path.read_bytes()[:-1000])
+    before = seen(folder)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            checkpoint.save_run({"weights": torch.zeros(100_000)}, folder)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert seen(folder) == before
+    checkpoint.save_run({"weights": torch.zeros(1)}, folder)
+    previous = checkpoint.read(folder / checkpoint.PREVIOUS)["run"]["iteration"]
+    assert previous == (4 if newest == "sound" else 2)
+
+
+def replaced(state, path, value):
+    """A nested state with one of its values replaced."""
+    if not path:
+        return value
+    return state | {path[0]: replaced(state[path[0]], path[1:], value)}
+
+
+def moments(network):
+    """Where the moments of a network's optimiser are."""
+    return ("learner", network, "_extra_state", "state", 0)
+
+
+WRONG = {
+    "moments of one number, which torch would believe": (
+        (*moments("value"), "exp_avg"),
+        torch.zeros(1),
+    ),
+    "moments of whole numbers": (
+        (*moments("value"), "exp_avg_sq"),
+        torch.zeros(1, dtype=torch.int64),
+    ),
+    "no step": ((*moments("value"), "step"), torch.zeros(0)),
+    "no outcome": (("learner", "curriculum", "estimator", "success"), torch.zeros(0)),
+    "goals of another size": (("learner", "curriculum", "visited"), torch.zeros(3, 5)),
+    "goals nowhere": (("learner", "curriculum", "replay"), torch.full((3, 2), 1e30)),
+    "episodes that are longer than time": (
+        ("collector", "age"),
+        torch.full((16,), 10**6),
+    ),
+    "more than is stored": (("learner", "places", "keys"), torch.zeros(1).expand(10**9)),
+    "no time": (("run", "seconds"), float("nan")),
+    "a policy alone": (("learner",), {"policy": {}, "places": {}}),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_checkpoint_that_was_made_to_be_wrong_is_one_line(name, folder):
+    """With its checksum right: that keeps nobody from anything."""
+    where, value = WRONG[name]
+    state = checkpoint.read(folder / checkpoint.NAME)
+    (folder / checkpoint.PREVIOUS).unlink()
+    checkpoint.save(replaced(state, where, value), folder / checkpoint.NAME)
+    done = call("train", "--resume", folder, "--iterations", 6, "--viz", "none")
+    assert done.returncode == 2, done.stderr
+    assert len(done.stderr.splitlines()) == 1 and "cannot resume" in done.stderr
+
+
+def test_settings_of_an_optimiser_are_not_taken_from_a_file(folder):
+    state = checkpoint.read(folder / checkpoint.NAME)
+    where = ("learner", "value", "_extra_state", "param_groups")
+    checkpoint.save(replaced(state, where, [{"betas": "x"}]), folder / checkpoint.NAME)
+    done = call("train", "--resume", folder, "--iterations", 6, "--viz", "none")
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_run_that_is_killed_after_its_first_iteration_goes_on(tmp_path):
+    cfg = settings("point_umaze", "recall_traces")
+    folder = new_folder(tmp_path / "run", replace(cfg, iterations=1))
+    with pytest.raises(ZeroDivisionError):
+        maze.train(cfg, folder, Fails())
+    assert checkpoint.read(folder / checkpoint.NAME)["run"]["iteration"] == 1
+
+
+class Fails(Stop):
+    """Asked the second time, it ends everything."""
+
+    asked = 0
+
+    @property
+    def requested(self):
+        self.asked += 1
+        return self.asked > 1 and 1 / 0
 
 
 def test_a_checkpoint_is_read_by_torch_alone(folder):
@@ -270,11 +419,11 @@ def test_a_damaged_frame_is_told_and_left_out(folder, tmp_path):
 
 
 def test_a_resumed_run_does_not_listen_where_its_folder_says(folder):
-    settings = json.loads((folder / "config.json").read_text())
-    settings |= {"viz_host": "0.0.0.0", "viz_port": 1, "viz": "browser"}
-    (folder / "config.json").write_text(json.dumps(settings))
+    told = json.loads((folder / "config.json").read_text())
+    told |= {"viz_host": "0.0.0.0", "viz_port": 1, "viz": "browser", "track": True}
+    (folder / "config.json").write_text(json.dumps(told))
     cfg = table.from_command_line(["--resume", str(folder), "--iterations", "6"])
-    assert (cfg.viz_host, cfg.viz_port) == ("127.0.0.1", 8080)
+    assert (cfg.viz_host, cfg.viz_port, cfg.track) == ("127.0.0.1", 8080, False)
 
 
 def test_a_page_that_cannot_start_is_told(folder, monkeypatch, capsys):
@@ -325,6 +474,13 @@ def test_a_host_that_is_not_this_machine_is_refused(view, host):
     assert " 403 " in told or " 400 " in told, told
 
 
+def test_two_hosts_or_two_origins_are_refused(view):
+    port = view.server.get_port()
+    for extra in ("Host: localhost", f"Origin: http://localhost:{port}\r\nOrigin: http://evil"):
+        request = f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\n{extra}\r\n\r\n"
+        assert " 403 " in answer(view, request.encode())
+
+
 @pytest.mark.parametrize("path", ["/../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd"])
 def test_no_file_outside_is_served(view, path):
     assert " 404 " in answer(view, f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
@@ -333,8 +489,9 @@ def test_no_file_outside_is_served(view, path):
 def test_what_is_loopback():
     assert is_loopback("127.0.0.1") and is_loopback("127.0.0.2") and is_loopback("localhost")
     assert not is_loopback("0.0.0.0")
-    assert of_this_machine("127.0.0.2") and of_this_machine("localhost") and of_this_machine("::1")
-    assert not of_this_machine("evil.example") and not of_this_machine(None)
+    assert of_this_machine("127.0.0.2") and of_this_machine("localhost")
+    assert of_this_machine("[::1]:80") and of_this_machine("localhost:8080")
+    assert not of_this_machine("evil.example") and not of_this_machine("")
 
 
 def test_on_another_loopback_address_a_foreign_name_is_refused_too(trained):

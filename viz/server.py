@@ -4,10 +4,10 @@ import contextlib
 import gzip
 import io
 import ipaddress
+import re
 import socket
 from html import escape
 from typing import Any
-from urllib.parse import urlsplit
 
 import viser
 import websockets.asyncio.server
@@ -15,6 +15,7 @@ from viser import _messages
 from websockets.datastructures import Headers
 from websockets.http11 import Response
 
+HOST = re.compile(r"(?:\[([0-9a-f:]+)\]|([a-z0-9.]+))(?::\d{1,5})?", re.IGNORECASE)
 MOST_VISITORS = 64  # at a time
 MOST_SENT = 2**20  # bytes of one message from a browser: clicks and the like are all
 
@@ -30,15 +31,20 @@ def is_loopback(host: str) -> bool:
     return all(ipaddress.ip_address(address).is_loopback for address in addresses)
 
 
-def of_this_machine(asked: str | None) -> bool:
+def of_this_machine(asked: str) -> bool:
     """Whether a `Host` names this machine as only who is on it can mean it. A foreign name that was
     made to point here is none."""
-    if asked is None or asked == "localhost":
-        return asked is not None
+    named = HOST.fullmatch(asked)
+    name = "" if named is None else (named[1] or named[2])
     try:
-        return ipaddress.ip_address(asked).is_loopback
+        return name == "localhost" or ipaddress.ip_address(name).is_loopback
     except ValueError:
         return False
+
+
+def of_page(origin: str, host: str) -> bool:
+    """Whether a page of that `Origin` is the one that this `Host` serves."""
+    return origin in (f"http://{host}", f"https://{host}")
 
 
 def titled(response: Any, title: str) -> Any:
@@ -72,13 +78,9 @@ def start_server(host: str, port: int, title: str = "goalgan_bt") -> viser.Viser
 
     def guarded(handler: Any, *args: Any, process_request: Any, **settings: Any) -> Any:
         def check(connection: Any, request: Any) -> Any:
-            asked, origin = request.headers.get("Host", ""), request.headers.get("Origin")
-            try:
-                own = origin is None or urlsplit(origin).netloc == asked
-                named = not alone or of_this_machine(urlsplit(f"//{asked}").hostname)
-            except ValueError:  # a name that is none
-                own = False
-            if not (own and named):
+            hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+            own = len(hosts) == 1 and all(of_page(origin, hosts[0]) for origin in origins)
+            if not own or len(origins) > 1 or (alone and not of_this_machine(hosts[0])):
                 return connection.respond(403, "This page talks to its own site only.\n")
             if here >= MOST_VISITORS and "Upgrade" in request.headers:
                 return connection.respond(503, "Too many are looking: try again later.\n")

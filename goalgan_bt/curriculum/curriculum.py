@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from goalgan_bt.agent.networks import first_weights
 from goalgan_bt.curriculum.alp_gmm import AlpGmm
 from goalgan_bt.curriculum.gan import GoalGAN
-from goalgan_bt.curriculum.goals import GoalMemory, SuccessEstimator, intermediate
+from goalgan_bt.curriculum.goals import GoalMemory, SuccessEstimator, goals_of, intermediate
 from goalgan_bt.curriculum.settings import GanConfig, GoalsConfig, conflicts
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.runs import checkpoint
@@ -316,8 +316,8 @@ class GoalCurriculum:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over what `state_dict` gave."""
         self.gan.load_state_dict(state["gan"])
-        self.replay.goals = state["replay"].numpy().copy()
-        self.visited.goals = state["visited"].numpy().copy()
+        self.replay.goals = goals_of(state["replay"], len(self.low))
+        self.visited.goals = goals_of(state["visited"], len(self.low))
         self.estimator.load_state_dict(state["estimator"])
         if self.alp_gmm is not None:
             self.alp_gmm.load_state_dict(state["alp_gmm"])

@@ -14,6 +14,7 @@ from torch import Tensor
 from goalgan_bt.curriculum.settings import GoalsConfig
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 
+FAR = 1e6  # metres, from where no goal is
 TRIES = 5000  # episodes whose failures count
 AT_ONCE = 1_000_000  # distances, so that many places visited cost time and not memory
 
@@ -37,7 +38,7 @@ class GoalMemory:
     """
 
     def __init__(self, goal_dim: int, distance: float) -> None:
-        self.goals = np.empty((0, goal_dim))
+        self.goals: FloatArray = np.empty((0, goal_dim))
         self.distance = distance
 
     def __len__(self) -> int:
@@ -63,6 +64,18 @@ class GoalMemory:
         return self.goals[rng.permutation(len(self.goals))[:n]]
 
 
+def goals_of(rows: Tensor, goal_dim: int) -> FloatArray:
+    """Goals that were saved, (n, goal_dim).
+
+    Raises:
+        ValueError: if they are none.
+    """
+    goals = rows.numpy().astype(float)
+    if goals.shape[1:] != (goal_dim,) or not (np.abs(goals) < FAR).all():
+        raise ValueError("goals that it remembers are none")
+    return goals
+
+
 class SuccessEstimator:
     """p(success | goal) from the start: the share of successes among the nearest recent episodes.
 
@@ -72,8 +85,8 @@ class SuccessEstimator:
 
     def __init__(self, goal_dim: int, cfg: GoalsConfig) -> None:
         self.cfg = cfg
-        self.goals = np.empty((0, goal_dim))
-        self.success = np.empty(0)
+        self.goals: FloatArray = np.empty((0, goal_dim))
+        self.success: FloatArray = np.empty(0)
 
     def add(self, goals: FloatArray, success: FloatArray | BoolArray) -> None:
         """Remember finished episodes: goals (n, goal_dim) and whether each was reached, (n,)."""
@@ -87,7 +100,11 @@ class SuccessEstimator:
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Take over what `state_dict` gave."""
-        self.goals, self.success = (state[name].numpy().copy() for name in ("goals", "success"))
+        goals = goals_of(state["goals"], self.goals.shape[1])
+        success = state["success"].numpy().astype(float)
+        if success.shape != (len(goals),) or not ((success >= 0) & (success <= 1)).all():
+            raise ValueError("the outcomes of its episodes are none")
+        self.goals, self.success = goals, success
 
     def __call__(self, goals: FloatArray) -> FloatArray:
         """Estimated success, (n, goal_dim) -> (n,) in [0, 1]; NaN while nothing is known."""

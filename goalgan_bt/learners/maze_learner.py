@@ -95,9 +95,12 @@ class MazeLearner:
         lengths = episodes.lengths[episodes.kept]
         left = np.repeat(np.cumsum(lengths), lengths) - np.arange(lengths.sum()) - 1
         goals = np.repeat(goals, lengths, axis=0)
-        rows = episodes.states, episodes.actions, episodes.next_states
-        if finite(*rows):  # one number that is none would end what learns from them
-            self.transitions.add(*rows, goals, left)
+        rows = episodes.states, episodes.actions, episodes.next_states, goals
+        whole = np.all([np.isfinite(row).all(axis=1) for row in rows], axis=0)
+        if not whole.all():  # one number that is none would end what learns from its episode
+            episode = np.repeat(np.arange(len(lengths)), lengths)
+            whole = ~np.isin(episode, episode[~whole])
+        self.transitions.add(*(row[whole] for row in rows), left[whole])
 
     def learn_places(self, rollouts: Rollouts) -> None:
         """Count the moves from place to place in the rollouts of all ranks, if anybody asks for
@@ -188,6 +191,8 @@ def load(learner: MazeLearner, folder: Path, collector: Collector | None = None)
         RunError: if there is none, or it is damaged or of other settings.
     """
     with checkpoint.saved(folder) as state:
+        if "value" not in state["learner"]:
+            raise ValueError("it holds a policy to be used, as those that are shipped")
         learner.load_state_dict(state["learner"])
         if broken := learner.broken():
             raise ValueError(f"a weight of the {broken} is not finite")

@@ -41,7 +41,8 @@ class Learner(NamedTuple):
     measure: str
 
 
-LOOKING = frozenset(("resume", "viz", "viz_host", "viz_port", "track"))
+WATCHING = "viz", "viz_host", "viz_port", "track"
+LOOKING = frozenset(("resume", *WATCHING))
 LEARNERS = (
     Learner(
         "goalgan_bt.learners.maze",
@@ -143,8 +144,8 @@ def from_command_line(argv: list[str]) -> Any:
     run = value_of(argv, "--resume")
     default: RunConfig
     if run is not None:
-        # The folder may be somebody else's: who looks, and from where, is for this command to say.
-        looking = {name: getattr(RunConfig, name) for name in ("viz", "viz_host", "viz_port")}
+        # The folder may be somebody else's: who is told, and where, is for this command to say.
+        looking = {name: getattr(RunConfig, name) for name in WATCHING}
         default = replace(load(Path(run)), resume=Path(run), **looking)
         learner = learner_of(default.env)
     else:

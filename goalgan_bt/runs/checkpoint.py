@@ -18,7 +18,7 @@ from typing import IO, Any
 import torch
 
 from goalgan_bt.runs.errors import RunError
-from goalgan_bt.runs.files import open_own, write_atomically
+from goalgan_bt.runs.files import new_file, open_own
 from goalgan_bt.runs.terminal import complain
 
 VERSION = 2  # of what is in it; 1 had no checksum
@@ -26,6 +26,7 @@ NAME, PREVIOUS = "checkpoint.pt", "checkpoint_previous.pt"
 SEAL = re.compile(rb"goalgan_bt (\d{3}) sha256 ([0-9a-f]{64})")
 SEALED = len(f"goalgan_bt 000 sha256 {'0' * 64}")
 CHUNK = 2**20
+MOST = 32 * 2**30  # bytes: SAC's replay of the largest body is a tenth of it
 
 
 def save(state: dict[str, Any], path: Path) -> None:
@@ -34,31 +35,45 @@ def save(state: dict[str, Any], path: Path) -> None:
     Raises:
         OSError: where that fails, as on a full disk.
     """
-    try:
-        write_atomically(path, lambda file: _write(state, file))
-    except RuntimeError as error:  # of torch's archive, which hides what stopped it
-        raise (error.__context__ or error) from None
+    with _new(state, path) as part:
+        part.replace(path)
 
 
 def save_run(state: dict[str, Any], folder: Path) -> None:
-    """Write a run's checkpoint and keep the one before it.
+    """Write a run's checkpoint and keep the one before it, if that is sound.
 
     Raises:
-        OSError: where that fails; the old one is then still there.
+        OSError: where that fails; both old ones are then as they were.
     """
-    path, previous = folder / NAME, folder / PREVIOUS
-    if path.exists():
-        kept = folder / f"{PREVIOUS}.part"
-        kept.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # where there are no hard links, there is no previous
-            kept.hardlink_to(path)
-            kept.replace(previous)
-    save(state, path)
+    path, kept = folder / NAME, folder / f"{PREVIOUS}.part"
+    with _new(state, path) as part:
+        if is_sound(path):
+            kept.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # without hard links there is no previous one
+                kept.hardlink_to(path)
+                kept.replace(folder / PREVIOUS)
+        part.replace(path)
     directory = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(directory)  # or a power cut could take back the new name
     finally:
         os.close(directory)
+
+
+@contextmanager
+def _new(state: dict[str, Any], path: Path) -> Iterator[Path]:
+    """A state beside the file whose place it shall take, complete and on the disk."""
+    part = path.with_name(path.name + ".part")
+    try:
+        with new_file(part) as file:
+            _write(state, file)
+            file.flush()
+            os.fsync(file.fileno())
+        yield part
+    except RuntimeError as error:  # of torch's archive, which hides what stopped it
+        raise (error.__context__ or error) from None
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _write(state: dict[str, Any], file: IO[bytes]) -> None:
@@ -83,6 +98,16 @@ class _Hashing:
         self._file.flush()
 
 
+def is_sound(path: Path) -> bool:
+    """Whether there is a checkpoint as it was written."""
+    try:
+        with open_own(path) as file:
+            check_seal(file)
+    except (OSError, ValueError):
+        return False
+    return True
+
+
 def check_seal(file: IO[bytes]) -> None:
     """See that a file is as it was written.
 
@@ -90,13 +115,16 @@ def check_seal(file: IO[bytes]) -> None:
         ValueError: if it is not, or of another version.
     """
     size = file.seek(0, os.SEEK_END) - SEALED
+    if size > MOST:
+        raise ValueError(f"it has more than {MOST:,} bytes")
     file.seek(max(size, 0))
     seal = SEAL.fullmatch(file.read())
     if seal is None:
         file.seek(0)
-        whole = zipfile.is_zipfile(file)
-        older, damaged = "it is of an older version of goalgan_bt", "it is damaged or cut short"
-        raise ValueError(older if whole else damaged)
+        with contextlib.suppress(zipfile.BadZipFile), zipfile.ZipFile(file) as archive:
+            if not archive.comment:
+                raise ValueError("it is of an older version of goalgan_bt: start a new run")
+        raise ValueError("it is damaged or cut short")
     if int(seal[1]) != VERSION:
         raise ValueError(f"it is of format {int(seal[1])}, and this version reads {VERSION}")
     found, left = hashlib.sha256(), size - 2
@@ -124,18 +152,41 @@ def read(path: Path) -> Any:
                 raise ValueError("it is no checkpoint: what it holds is larger than itself")
         file.seek(0)
         try:
-            return torch.load(file, weights_only=True)
+            state = torch.load(file, weights_only=True)
         except Exception as error:  # torch raises many kinds
             raise ValueError(f"it is damaged ({reason(error)})") from None
+    for tensor in tensors_of(state):
+        if tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes():
+            raise ValueError("it is no checkpoint: a tensor is larger than what is stored of it")
+    return state
+
+
+def tensors_of(state: Any) -> Iterator[torch.Tensor]:
+    """All tensors of a nested state."""
+    if isinstance(state, torch.Tensor):
+        yield state
+    elif isinstance(state, dict | list | tuple):
+        for part in state.values() if isinstance(state, dict) else state:
+            yield from tensors_of(part)
 
 
 def restore(module: Any, state: dict[str, Any]) -> None:
-    """Put a state into a network or an optimiser; the latter keeps its learning rate, which a run
-    that goes on may have changed."""
-    rates = [group["lr"] for group in getattr(module, "param_groups", [])]
+    """Put a state into a network, or the moments of one into an optimiser, whose settings stay what
+    they are: a run that goes on may have changed its learning rate.
+
+    Raises:
+        ValueError: for moments that are none of its parameters: torch would believe their sizes,
+            and read and write where nothing of its own is.
+    """
+    if isinstance(module, torch.optim.Optimizer):
+        parameters = [param for group in module.param_groups for param in group["params"]]
+        for i, moments in state["state"].items():
+            for name, moment in moments.items():
+                shape = torch.Size() if name == "step" else parameters[i].shape
+                if moment.shape != shape or moment.dtype != torch.float32:
+                    raise ValueError(f"{name} of an optimiser is of another size")
+        state = {"state": state["state"], "param_groups": module.state_dict()["param_groups"]}
     module.load_state_dict(state)
-    for group, rate in zip(getattr(module, "param_groups", []), rates, strict=True):
-        group["lr"] = rate
 
 
 @contextmanager
@@ -186,6 +237,7 @@ def saved(folder: Path) -> Iterator[dict[str, Any]]:
             ) from None
         why = "there is none" if missing else error
         complain(f"{path}: {why}; the one before it is used, {previous.name}", "warning")
+        path = previous
     try:
         yield state
     except Exception as error:  # of whatever it is put into

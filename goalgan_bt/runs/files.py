@@ -5,7 +5,7 @@ import os
 import stat
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any, BinaryIO
+from typing import IO, Any, BinaryIO, TextIO
 
 from goalgan_bt.runs.errors import RunError
 
@@ -25,6 +25,16 @@ def open_own(path: Path) -> BinaryIO:
         os.close(file)
         raise OSError(f"{path} is no file")
     return os.fdopen(file, "rb")
+
+
+def open_to_write(path: Path) -> TextIO:
+    """Open a file to append text, if it is none yet or one, and no link.
+
+    Raises:
+        OSError: if it is something else, or cannot be written.
+    """
+    flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+    return os.fdopen(os.open(path, flags, 0o666), "a", newline="")
 
 
 def read_own(path: Path, most: int = LARGE) -> bytes:

@@ -115,6 +115,8 @@ class Metrics:
                 stamp = status.st_ino, status.st_size, status.st_mtime_ns
                 if stamp == self._stamp:
                     return False
+                if status.st_size > LARGE:  # nothing of ours
+                    return False
                 header = file.readline()
                 same = stamp[0] == self._stamp[0] and header == self._header
                 if not same or status.st_size < self._read:  # another table

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from goalgan_bt.runs.errors import RunError
-from goalgan_bt.runs.files import check_own, write_atomically
+from goalgan_bt.runs.files import check_own, open_to_write, write_atomically
 from goalgan_bt.runs.frames import frame_paths
 from goalgan_bt.runs.metrics_csv import sound_rows, write_table
 from goalgan_bt.runs.run_folder import ENDED, end_run, note_resumed
@@ -34,7 +34,7 @@ class RunWriter:
     ) -> None:
         self.folder = folder
         check_own(folder)
-        self._lock = (folder / "lock").open("w")
+        self._lock = open_to_write(folder / "lock")
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -95,7 +95,7 @@ class RunWriter:
             self._columns += new
             self._rewrite()
         else:
-            with (self.folder / "metrics.csv").open("a", newline="") as file:
+            with open_to_write(self.folder / "metrics.csv") as file:
                 writer = csv.DictWriter(file, self._columns, restval="", lineterminator="\n")
                 writer.writerow(cells)
         if self._events is not None:

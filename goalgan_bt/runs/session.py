@@ -112,9 +112,10 @@ class Session:
             self.steps, seconds = dict(state["steps"]), state["seconds"]
         self.clock = Clock(seconds)
         if state is not None and self._done() >= 1:
+            limit = "--" + self._first_limit().replace("_", "-")
             raise RunError(
                 f"{folder} has reached its limits ({self.iteration} iterations, "
-                f"{self.steps['train']} steps): ask for more, for example with --total-steps"
+                f"{self.steps['train']} steps): ask for more with {limit}"
             )
         self.progress = 0.0
         self.row: dict[str, float] = {}
@@ -184,8 +185,9 @@ class Session:
 
     @property
     def saves(self) -> bool:
-        """Whether the state is saved after this iteration."""
-        return self._measures or self._last
+        """Whether the state is saved after this iteration: the first, lest a run that is killed
+        early is lost, those that measure, and the last."""
+        return self._measures or self._last or self.iteration == 1
 
     @property
     def reports(self) -> bool:
@@ -250,12 +252,22 @@ class Session:
 
     def _done(self) -> float:
         """How far the run is towards the first of its limits: 1 or more at its end."""
+        return max(self._shares().values())
+
+    def _first_limit(self) -> str:
+        """The limit that comes first."""
+        shares = self._shares()
+        return max(shares, key=shares.__getitem__)
+
+    def _shares(self) -> dict[str, float]:
+        """How far the run is towards each of its limits."""
         limits = self._limits
-        return max(
-            self.iteration / limits.iterations if limits.iterations else 0.0,
-            self.steps["train"] / limits.total_steps if limits.total_steps else 0.0,
-            self.clock.total() / (60 * limits.minutes) if limits.minutes else 0.0,
-        )
+        minutes = self.clock.total() / 60
+        return {
+            "total_steps": self.steps["train"] / limits.total_steps if limits.total_steps else 0.0,
+            "iterations": self.iteration / limits.iterations if limits.iterations else 0.0,
+            "minutes": minutes / limits.minutes if limits.minutes else 0.0,
+        }
 
     def __enter__(self) -> "Session":
         return self
