@@ -70,6 +70,16 @@ def test_a_fault_in_a_reader_would_be_found(tmp_path, monkeypatch):
         signal.signal(signal.SIGALRM, before)
 
 
+def test_the_document_holds_the_counts(tmp_path):
+    """Those of the files, none of them wrong."""
+    text = (ROOT / "docs/reliability.md").read_text()
+    for name, words in (("kills.json", "trainings killed"), ("fuzz.json", "all damaged inputs")):
+        counts = json.loads((ROOT / "docs/runs" / name).read_text())
+        (line,) = [line for line in text.splitlines() if words in line]
+        cases = counts["kills"] if "kills" in counts else sum(n["cases"] for n in counts.values())
+        assert f" {cases:,} |" in line and line.rstrip(" |*").endswith(" 0"), line
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(3000)
 def test_two_hundred_kills(tmp_path):

@@ -155,7 +155,7 @@ def test_half_a_folder_is_removed(trained, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("shutil.copyfile", full)
+    monkeypatch.setattr("goalgan_bt.share.read_own", full)
     done = call("share", trained, "--out", tmp_path / "out")
     assert done.returncode == 2 and "the disk is full" in done.stderr
     assert not (tmp_path / "out").exists()

@@ -24,6 +24,7 @@ from typing import Any
 from goalgan_bt.runs.background import Background, group
 from goalgan_bt.runs.clock import Clock
 from goalgan_bt.runs.errors import RunError, UsageError
+from goalgan_bt.runs.ranges import SANE
 from goalgan_bt.runs.run_folder import settings_of, write_settings
 from goalgan_bt.runs.run_writer import RunWriter
 from goalgan_bt.runs.signals import Stop
@@ -303,7 +304,7 @@ def checked(state: Mapping[str, Any]) -> dict[str, Any]:
     for name in ("train", "label", "eval"):
         steps[name] = int(state["steps"][name])
     seconds, following = float(state["seconds"]), float(state["next_measurement"])
-    if not all(0 <= n < math.inf for n in (iteration, seconds, following, *steps.values())):
+    if not all(0 <= n < SANE for n in (iteration, seconds, following, *steps.values())):
         raise ValueError("what it says of the run's time cannot be")
     return {
         "iteration": iteration,
