@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from goalgan_bt.runs.errors import RunError
 from goalgan_bt.runs.files import LARGE, open_own, read_own, write_atomically
 
+LARGEST = 4 * 2**30  # bytes, of the table of a run of years
 COUNT = re.compile(r"[0-9]{1,18},[0-9]{1,18}$")
 
 
@@ -68,11 +69,17 @@ def read_metrics(folder: Path) -> tuple[list[str], list[dict[str, str]]]:
 
 def sound_rows(folder: Path) -> tuple[list[str], list[dict[str, str]], int]:
     """Columns and rows of a run's `metrics.csv` as far as they are sound, none where there is no
-    such table, and how many are not."""
+    such table, and how many are not.
+
+    Raises:
+        RunError: if there is something that cannot be read, or is too large to be one.
+    """
     try:
-        text = read_own(folder / "metrics.csv").decode(errors="replace")
-    except OSError:
+        text = read_own(folder / "metrics.csv", LARGEST).decode(errors="replace")
+    except FileNotFoundError:
         return [], [], 0
+    except OSError as error:
+        raise RunError(f"{error}: move it away, and the run goes on without it") from None
     columns, *lines = list(_cells(text)) or [[]]
     if not {"iteration", "steps/train"} <= {*columns} or len({*columns}) < len(columns):
         return [], [], len(lines)

@@ -50,7 +50,7 @@ class RunWriter:
         """Keep what the folder holds up to an iteration."""
         folder = self.folder
         self._columns, rows, lost = sound_rows(folder)
-        self._rows = [row for row in rows if int(row["iteration"]) <= iteration]
+        kept = [row for row in rows if int(row["iteration"]) <= iteration]
         if resumed:
             note_resumed(folder)
         (folder / "frames").mkdir(exist_ok=True)
@@ -58,13 +58,13 @@ class RunWriter:
         for left in (*folder.glob("*.part"), *(folder / "frames").glob("*.part")):
             left.unlink()  # of a process that was killed while it wrote
         if self._columns:
-            self._rewrite()
+            self._rewrite(kept)
         if iteration:
             self._tell_gaps(iteration, {int(row["iteration"]) for row in rows}, lost)
         for frame in frame_paths(folder):
             if int(frame.stem) > iteration:
                 frame.unlink()
-        known = int(self._rows[-1]["steps/train"]) if self._rows else 0
+        known = int(kept[-1]["steps/train"]) if kept else 0
         self._events = _tensorboard(folder, known) if events else None
 
     def _tell_gaps(self, iteration: int, known: set[int], lost: int) -> None:
@@ -89,11 +89,11 @@ class RunWriter:
         """Append a row; a value that is missing or NaN is an empty cell."""
         cells = {k: f"{v:.6g}" if isinstance(v, float) else str(v) for k, v in row.items()}
         cells = {k: "" if v == "nan" else v for k, v in cells.items()}
-        self._rows.append(cells)
         new = [name for name in cells if name not in self._columns]
-        if new:
+        if new:  # rare: nothing that is written is kept in memory for it
+            _, rows, _ = sound_rows(self.folder)
             self._columns += new
-            self._rewrite()
+            self._rewrite([*rows, cells])
         else:
             with open_to_write(self.folder / "metrics.csv") as file:
                 writer = csv.DictWriter(file, self._columns, restval="", lineterminator="\n")
@@ -132,8 +132,8 @@ class RunWriter:
         with (self.folder / "metrics.csv").open("rb") as file:
             os.fsync(file.fileno())
 
-    def _rewrite(self) -> None:
-        write_table(self.folder / "metrics.csv", self._columns, self._rows)
+    def _rewrite(self, rows: list[dict[str, str]]) -> None:
+        write_table(self.folder / "metrics.csv", self._columns, rows)
 
 
 def _tensorboard(folder: Path, steps: int) -> Any:
