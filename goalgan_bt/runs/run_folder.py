@@ -154,7 +154,7 @@ def read_settings(kind: type[T], folder: Path) -> T:
         return _build(kind, json.loads(read_own(path, SMALL)))
     except FileNotFoundError:
         raise RunError(f"{folder} is no run: it has no config.json{inside(folder)}") from None
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, OverflowError) as error:
         raise RunError(f"cannot read {path}: {error}") from None
 
 
@@ -256,5 +256,5 @@ def maze_of(folder: Path) -> Maze | None:
         if not 0 < side < 1e3:
             raise ValueError(f"cells of {side} m")
         return Maze(tuple(maze["rows"]), side)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise RunError(f"{folder / 'meta.json'} is damaged: {error!r}") from None
