@@ -47,7 +47,7 @@ def read_own(path: Path, most: int = LARGE) -> bytes:
         size = os.fstat(file.fileno()).st_size
         if size > most:
             raise OSError(f"{path} has {size:,} bytes, where at most {most:,} make sense")
-        return file.read(most)
+        return file.read(size)  # for more, as much memory would be taken at once
 
 
 def check_own(folder: Path) -> None:

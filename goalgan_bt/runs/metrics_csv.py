@@ -131,7 +131,7 @@ class Metrics:
                     self._header = header
                 self._stamp, self.changed = stamp, status.st_mtime
                 file.seek(self._read)
-                new = file.read(LARGE)
+                new = file.read(max(0, status.st_size - self._read))
         except OSError:  # none yet, or just being replaced
             return False
         whole = new[: new.rfind(b"\n") + 1]
