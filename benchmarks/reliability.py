@@ -37,6 +37,25 @@ TESTS = {
     "faults planted": ("tests/test_faults.py",),
     "folders and visitors that mean harm": ("tests/test_strangers.py",),
 }
+KINDS = {  # of `benchmarks/fuzz.py`
+    "map": "maps",
+    "env": "names and sizes of environments",
+    "flags": "flags of the command line",
+    "settings": "`config.json`, its bytes",
+    "values": "`config.json`, its values",
+    "meta": "`meta.json`",
+    "metrics": "`metrics.csv`",
+    "run": "run folders, as the page reads them",
+    "frame": "frames, their bytes",
+    "arrays": "frames, their arrays",
+    "bytes_of_checkpoint": "checkpoints, their bytes",
+    "state": "checkpoints with their checksum right, loaded",
+    "resume": "such checkpoints, trained on from",
+    "places": "places of a checkpoint",
+    "study": "study files",
+    "tell": "arguments of `GoalCurriculum.tell`",
+    "ask": "arguments of `GoalCurriculum.ask`",
+}
 Part = Literal["kills", "fuzz", "tests", "checkpoints", "page", "table"]
 
 
@@ -121,8 +140,7 @@ def rows() -> list[Sequence[object]]:
         lines.append((f"{name} (tests)", count["tests"], count["failed"]))
     if fuzz := known("fuzz.json"):
         for kind, count in fuzz.items():
-            words = kind.replace("_", " ")
-            lines.append((f"damaged or absurd: {words}", count["cases"], count["wrong"]))
+            lines.append((f"damaged or absurd: {KINDS[kind]}", count["cases"], count["wrong"]))
         total = [sum(count[key] for count in fuzz.values()) for key in ("cases", "wrong")]
         lines.append(("**all damaged inputs**", *total))
     return lines
