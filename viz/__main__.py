@@ -87,9 +87,10 @@ def serve(cfg: ViewConfig) -> None:
     from goalgan_bt.viz.server import is_loopback
     from goalgan_bt.viz.view import View
 
+    runs = [Run(folder) for folder in cfg.runs]
     os.nice(19)  # looking must not slow learning; threads take it from the one that starts them
     port = free_port(cfg.host, cfg.port)
-    view = View([Run(folder) for folder in cfg.runs], cfg.host, port)
+    view = View(runs, cfg.host, port)
     busy = cfg.port not in (0, view.server.get_port())
     say(f"view: {view.address}" + (f" (port {cfg.port} was busy)" if busy else ""))
     if not is_loopback(cfg.host):
