@@ -75,8 +75,10 @@ def is_sound(folder):
     return finite(*weights) and done.returncode == 0
 
 
-@pytest.mark.parametrize("number", [math.nan, math.inf])
-@pytest.mark.parametrize("name", ["rewards", "obs", "last_obs", "actions"])
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [("rewards", math.nan), ("rewards", math.inf), ("obs", math.nan), ("last_obs", math.inf)],
+)
 def test_a_batch_that_is_not_finite_is_left_out(name, number, tmp_path, monkeypatch, capsys):
     """A single number, which was enough to end the value function for ever."""
 

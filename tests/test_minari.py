@@ -167,7 +167,8 @@ def test_other_runs_and_what_is_missing_are_refused_in_one_line(folder, monkeypa
         (folder / "config.json").write_text(json.dumps(settings | {"env": env}))
         refused(folder, f"is a run of {env}: --minari goes with")
     (folder / "config.json").write_text(json.dumps(settings))
-    (folder / "checkpoint.pt").unlink()
+    for name in ("checkpoint.pt", "checkpoint_previous.pt"):
+        (folder / name).unlink()
     refused(folder, "has no checkpoint.pt")
     for library, other in (("h5py", "minari"), ("minari", "h5py")):
         monkeypatch.setattr("importlib.util.find_spec", {other: "is there"}.get)

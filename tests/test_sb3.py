@@ -206,8 +206,16 @@ def test_agents_that_are_not_gaussian_are_refused():
         RecallTraces().save("nowhere")
 
 
-@pytest.mark.parametrize("name", ["PPO", "TRPO", "SAC"])
-@pytest.mark.parametrize("model", ["backward", "forward"])
+@pytest.mark.parametrize(
+    ("name", "model"),
+    [
+        ("PPO", "backward"),
+        ("SAC", "backward"),
+        ("TRPO", "forward"),
+        pytest.param("TRPO", "backward", marks=pytest.mark.slow),
+        pytest.param("SAC", "forward", marks=pytest.mark.slow),
+    ],
+)
 def test_saved_and_loaded_it_goes_on_as_if_it_had_not_been(name, model, tmp_path):
     """Agent, callback and environments: bit for bit, in the middle of episodes."""
 

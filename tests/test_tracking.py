@@ -48,7 +48,8 @@ def test_the_metrics_of_a_run_and_of_what_goes_on_with_it(tmp_path, monkeypatch)
     words = *TINY.split(), "--viz", "none", "--out", tmp_path
     assert call("train", *words, "--track").returncode == 0
     (folder,) = tmp_path.iterdir()
-    assert call("train", "--resume", folder, "--iterations", 6, "--viz", "none").returncode == 0
+    more = "--iterations", 6, "--viz", "none", "--track"  # the folder does not decide it
+    assert call("train", "--resume", folder, *more).returncode == 0
     config, rows = written(folder)
     assert config["seed"] == 0 and config["env"] == "point_umaze"
     names, table = read_metrics(folder)

@@ -26,7 +26,7 @@ class RunConfig:
     """Go on with this run (its folder), with its settings."""
     track: bool = False
     """Give the metrics to Weights & Biases, too (extra `wandb`): offline, in the run folder, unless
-    WANDB_MODE says otherwise."""
+    WANDB_MODE says otherwise. To be said again with --resume."""
     viz: Literal["browser", "none"] = "browser"
     """Where to watch: a page in the browser, in a process of its own, or nowhere. Only mazes and
     point_nd have a map to show."""
