@@ -1,5 +1,6 @@
 """What the benchmarks share: a stopwatch, and the words for the machine and its software."""
 
+import json
 import os
 import platform
 import time
@@ -7,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from importlib.metadata import PackageNotFoundError, version
 from multiprocessing import active_children
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 PACKAGES = "mujoco torch numpy gymnasium gymnasium-robotics stable-baselines3 sb3-contrib envpool"
 
@@ -83,3 +84,10 @@ def _processor() -> str:
         lines = []
     models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     return models[0] if models else platform.processor() or platform.machine()
+
+
+def told(counts: dict[str, Any], path: Path | None) -> None:
+    """Print counts as JSON, and write them to a file if one is named."""
+    print(json.dumps(counts))
+    if path is not None:
+        path.write_text(json.dumps(counts, indent=1) + "\n")

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from common import told
 
 from goalgan_bt import envs
 from goalgan_bt.curriculum.curriculum import GoalCurriculum
@@ -354,9 +355,7 @@ def fuzz(cfg: FuzzConfig) -> dict[str, dict[str, int]]:
 
 def main(cfg: FuzzConfig) -> None:
     counts = fuzz(cfg)
-    print(json.dumps(counts))
-    if cfg.json is not None:
-        cfg.json.write_text(json.dumps(counts, indent=1) + "\n")
+    told(counts, cfg.json)
     sys.exit(any(kind["wrong"] for kind in counts.values()))
 
 

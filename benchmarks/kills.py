@@ -7,7 +7,6 @@ process that has imported everything forks the trainings, so that a kill costs n
 """
 
 import io
-import json
 import os
 import signal
 import sys
@@ -21,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from common import told
 
 from goalgan_bt.learners import maze, table
 from goalgan_bt.runs import checkpoint, run_folder
@@ -184,9 +184,7 @@ def run(cfg: KillsConfig) -> dict[str, int]:
 
 def main(cfg: KillsConfig) -> None:
     counts = run(cfg)
-    print(json.dumps(counts))
-    if cfg.json is not None:
-        cfg.json.write_text(json.dumps(counts, indent=1) + "\n")
+    told(counts, cfg.json)
     sys.exit(any(counts[name] for name in ("unreadable", "lost", "different")))
 
 

@@ -8,7 +8,6 @@ from goalgan_bt.runs.signals import exit_with, leave_at_once
 if __name__ == "__main__":  # nothing to lose: it goes at once, without a word
     leave_at_once()
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,7 +15,7 @@ from typing import Annotated, Any
 import tyro
 
 from goalgan_bt.runs.command_line import check_ranges, check_target, parse, run_command
-from goalgan_bt.runs.files import write_atomically
+from goalgan_bt.runs.files import write_json
 from goalgan_bt.runs.ranges import NOT_NEGATIVE, between
 from goalgan_bt.runs.terminal import say
 
@@ -65,8 +64,7 @@ def work(argv: list[str] | None) -> None:
         found = evaluation.elsewhere(cfg.run, cfg.on, cfg.episodes, cfg.deterministic, cfg.seed)
     say(sentence(found))
     if cfg.json is not None:
-        text = json.dumps(found, indent=2) + "\n"
-        write_atomically(cfg.json, lambda file: file.write(text.encode()))
+        write_json(cfg.json, found)
         say(str(cfg.json))
 
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from goalgan_bt.runs.metrics_csv import Metrics
+from goalgan_bt.runs.run_folder import flat
 from goalgan_bt.viz.run import Run, success
 
 SILENT = 120.0  # seconds without news after which a run counts as stopped
@@ -61,15 +62,9 @@ def caption(run: Run, iteration: int) -> str:
     return " · ".join(words)
 
 
-def settings_rows(settings: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+def settings_rows(settings: dict[str, Any]) -> list[tuple[str, str]]:
     """Settings as rows of name, with dots, and value."""
-    rows = []
-    for name, value in settings.items():
-        if isinstance(value, dict):
-            rows += settings_rows(value, f"{prefix}{name}.")
-        else:
-            rows.append((prefix + name, str(value)))
-    return rows
+    return [(name, str(value)) for name, value in flat(settings)]
 
 
 def settings_table(settings: dict[str, Any]) -> str:

@@ -4,7 +4,6 @@ A run may be live (files grow and appear while they are read), finished, of anot
 """
 
 import contextlib
-import json
 import time
 from collections import OrderedDict
 from pathlib import Path
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 from goalgan_bt.envs.maze import FloatArray
 from goalgan_bt.runs import run_folder
 from goalgan_bt.runs.errors import RunError
-from goalgan_bt.runs.files import read_own
 from goalgan_bt.runs.frames import frame_paths, read_frame
 from goalgan_bt.runs.metrics_csv import Metrics
 
@@ -45,14 +43,12 @@ class Run:
     def __init__(self, folder: Path) -> None:
         self.folder, self.name = folder, folder.resolve().name
         self.maze = run_folder.maze_of(folder)
-        try:
-            settings = json.loads(read_own(folder / "config.json", run_folder.SMALL))
-            self.env, self.settings = str(settings["env"]), dict(settings)
-            own_map = settings.get("map")
-            body = self.env.rpartition(":")[2].split("_")[0].lower()
-            self.task = self.env if own_map is None else f"{body}_{Path(str(own_map)).stem}"
-        except (OSError, ValueError, KeyError, TypeError, RecursionError):
-            raise RunError(f"{folder} is no run: it has no readable config.json") from None
+        self.settings = run_folder.settings_of(folder)
+        if "env" not in self.settings:
+            raise RunError(f"{folder} is no run: it has no readable config.json")
+        self.env, own_map = str(self.settings["env"]), self.settings.get("map")
+        body = self.env.rpartition(":")[2].split("_")[0].lower()
+        self.task = self.env if own_map is None else f"{body}_{Path(str(own_map)).stem}"
         self.iterations: list[int] = []
         self.metrics = Metrics(folder / "metrics.csv")
         self.gone = False

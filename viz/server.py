@@ -6,6 +6,7 @@ import io
 import ipaddress
 import re
 import socket
+from functools import lru_cache
 from html import escape
 from typing import Any
 
@@ -52,13 +53,18 @@ def titled(response: Any, title: str) -> Any:
     if response is None or not response.headers.get("Content-Type", "").startswith("text/html"):
         return response
     zipped = response.headers.get("Content-Encoding") == "gzip"
-    body = gzip.decompress(response.body) if zipped else response.body
-    body = body.replace(b"<title>Viser</title>", f"<title>{escape(title)}</title>".encode(), 1)
-    body = gzip.compress(body) if zipped else body
+    body = _with_title(response.body, title, zipped)
     headers = Headers(response.headers)
     del headers["Content-Length"]
     headers["Content-Length"] = str(len(body))
     return Response(response.status_code, response.reason_phrase, headers, body)
+
+
+@lru_cache(maxsize=4)  # viser gives the same page each time
+def _with_title(page: bytes, title: str, zipped: bool) -> bytes:
+    body = gzip.decompress(page) if zipped else page
+    body = body.replace(b"<title>Viser</title>", f"<title>{escape(title)}</title>".encode(), 1)
+    return gzip.compress(body) if zipped else body
 
 
 def start_server(host: str, port: int, title: str = "goalgan_bt") -> viser.ViserServer:

@@ -159,14 +159,15 @@ class Collector:
             complain("the simulations begin anew: this is not the same run, bit for bit", "note")
             self.begin(rows["goals"])
             return
-        for name, table in self.env.state_dict().items():
+        here = self.env.state_dict()
+        for name, table in here.items():
             if rows[name].shape != (self._total, *table.shape[1:]):
                 raise ValueError(f"the {name} of its simulations are of other sizes")
         if age.min() < 0 or age.max() >= longest:
             raise ValueError("its episodes are too long")
         if (rows["elapsed"] != age * self.env.action_repeat).any():
             raise ValueError("the clocks of its simulations do not fit their episodes")
-        self.env.load_state_dict({name: rows[name][self._mine] for name in self.env.state_dict()})
+        self.env.load_state_dict({name: rows[name][self._mine] for name in here})
         self._age[:], self._from_start[:] = age[self._mine], rows["from_start"][self._mine]
         before = age[: self._mine.start]  # of other ranks
         for name, table, used, more in self._so_far():

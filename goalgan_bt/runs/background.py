@@ -36,7 +36,7 @@ class Background:
 
     def wait(self, *names: str) -> None:
         """Until these have ended, if they were started."""
-        for name in list(names):
+        for name in names:
             if name in self._running:
                 told = self._running.pop(name).result()
                 if "undone" in told:  # rare, and thus counted over the run (see `soundly`)

@@ -18,7 +18,7 @@ from typing import IO, Any
 import torch
 
 from goalgan_bt.runs.errors import RunError
-from goalgan_bt.runs.files import new_file, open_own
+from goalgan_bt.runs.files import open_own, written_beside
 from goalgan_bt.runs.terminal import complain
 
 VERSION = 2  # of what is in it; 1 had no checksum
@@ -62,18 +62,12 @@ def save_run(state: dict[str, Any], folder: Path) -> None:
 
 @contextmanager
 def _new(state: dict[str, Any], path: Path) -> Iterator[Path]:
-    """A state beside the file whose place it shall take, complete and on the disk."""
-    part = path.with_name(path.name + ".part")
+    """A state beside the file whose place it shall take."""
     try:
-        with new_file(part) as file:
-            _write(state, file)
-            file.flush()
-            os.fsync(file.fileno())
-        yield part
+        with written_beside(path, lambda file: _write(state, file)) as part:
+            yield part
     except RuntimeError as error:  # of torch's archive, which hides what stopped it
         raise (error.__context__ or error) from None
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _write(state: dict[str, Any], file: IO[bytes]) -> None:

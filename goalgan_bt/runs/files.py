@@ -1,9 +1,11 @@
 """Files of a folder that may come from a stranger: read whole and within a size, written all or
 nothing, and never through a link that leads elsewhere."""
 
+import json
 import os
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, BinaryIO, TextIO
 
@@ -67,16 +69,29 @@ def check_own(folder: Path) -> None:
 
 def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
     """Call `write(binary file)` on a temporary file that then takes `path`'s place."""
-    temporary = path.with_name(path.name + ".part")
+    with written_beside(path, write) as part:
+        part.replace(path)
+
+
+@contextmanager
+def written_beside(path: Path, write: Callable[[Any], object]) -> Iterator[Path]:
+    """A temporary file on which `write(binary file)` was called, complete and on the disk, for who
+    lets it take `path`'s place; else it goes."""
+    part = path.with_name(path.name + ".part")
     try:
-        with new_file(temporary) as file:
+        with new_file(part) as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+        yield part
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a value as JSON, all or nothing; what JSON does not know as text."""
+    text = json.dumps(value, indent=2, default=str) + "\n"
+    write_atomically(path, lambda file: file.write(text.encode()))
 
 
 def new_file(path: Path) -> IO[bytes]:

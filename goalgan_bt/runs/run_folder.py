@@ -21,6 +21,7 @@ import sys
 import time
 import types
 import typing
+from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from importlib import metadata
 from pathlib import Path
@@ -28,7 +29,7 @@ from typing import Any, TypeVar
 
 from goalgan_bt.envs.maze import Maze
 from goalgan_bt.runs.errors import RunError
-from goalgan_bt.runs.files import new_file, read_own, write_atomically
+from goalgan_bt.runs.files import new_file, read_own, write_json
 from goalgan_bt.runs.terminal import complain
 
 T = TypeVar("T")
@@ -103,8 +104,7 @@ def write_meta(folder: Path, maze: Maze | None) -> None:
         "versions": versions,
         "maze": None if maze is None else {"rows": maze.rows, "cell_size": maze.cell_size},
     }
-    text = json.dumps(meta, indent=2) + "\n"
-    write_atomically(folder / "meta.json", lambda file: file.write(text.encode()))
+    write_json(folder / "meta.json", meta)
 
 
 def _call() -> dict[str, Any]:
@@ -115,8 +115,7 @@ def note_resumed(folder: Path) -> None:
     """Add to `meta.json` what a run is taken up with: the code may be another by now."""
     meta = read_meta(folder)
     meta["resumed"] = [*meta.get("resumed", []), _call()]
-    text = json.dumps(meta, indent=2) + "\n"
-    write_atomically(folder / "meta.json", lambda file: file.write(text.encode()))
+    write_json(folder / "meta.json", meta)
 
 
 def mend_meta(folder: Path, maze: Maze | None) -> None:
@@ -139,8 +138,7 @@ def commits(folder: Path) -> str:
 
 def write_settings(folder: Path, settings: dict[str, Any]) -> None:
     """Write the resolved settings to `config.json`."""
-    text = json.dumps(settings, indent=2, default=str) + "\n"
-    write_atomically(folder / "config.json", lambda file: file.write(text.encode()))
+    write_json(folder / "config.json", settings)
 
 
 def read_settings(kind: type[T], folder: Path) -> T:
@@ -171,6 +169,15 @@ def settings_of(folder: Path) -> dict[str, Any]:
         return settings if isinstance(settings, dict) else {}
     except (OSError, ValueError, RecursionError):
         return {}
+
+
+def flat(settings: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    """Nested settings by name, those of a part as `trpo.max_kl`."""
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{before}{name}.")
+        else:
+            yield before + name, value
 
 
 def _build(kind: type[T], values: Any) -> T:

@@ -15,7 +15,7 @@ Whatever learns, its loop is
 import json
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -25,7 +25,7 @@ from goalgan_bt.runs.background import Background, group
 from goalgan_bt.runs.clock import Clock
 from goalgan_bt.runs.errors import RunError, UsageError
 from goalgan_bt.runs.ranges import SANE
-from goalgan_bt.runs.run_folder import settings_of, write_settings
+from goalgan_bt.runs.run_folder import flat, settings_of, write_settings
 from goalgan_bt.runs.run_writer import RunWriter
 from goalgan_bt.runs.signals import Stop
 from goalgan_bt.runs.terminal import Terminal, complain
@@ -317,21 +317,13 @@ def checked(state: Mapping[str, Any]) -> dict[str, Any]:
 
 def changed(folder: Path, settings: Mapping[str, Any]) -> list[str]:
     """What a run that goes on does otherwise than before, of all that its results depend on."""
-
-    def flat(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
-        for name, value in values.items():
-            if isinstance(value, Mapping):
-                yield from flat(value, f"{before}{name}.")
-            elif before + name not in HARMLESS:
-                yield before + name, value
-
     old = dict(flat(settings_of(folder)))
     new = dict(flat(json.loads(json.dumps(settings, default=str))))
     flags = {name: "--" + name.replace("_", "-") for name in new}
     changes = [
         f"{flags[name]} was {old[name]} and is {new[name]}"
         for name in new
-        if name in old and old[name] != new[name]
+        if name in old and old[name] != new[name] and name not in HARMLESS
     ]
     clock = [f"{flags['minutes']} goes by the clock"] if new.get("minutes") else []
     return changes + clock
