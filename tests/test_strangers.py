@@ -28,7 +28,13 @@ from goalgan_bt.runs.metrics_csv import Metrics, read_metrics
 from goalgan_bt.runs.signals import Stop
 from goalgan_bt.viz import page_process
 from goalgan_bt.viz.run import Run
-from goalgan_bt.viz.server import MOST_VISITORS, is_loopback, of_this_machine
+from goalgan_bt.viz.server import (
+    MESSAGES,
+    MOST_VISITORS,
+    Allowance,
+    is_loopback,
+    of_this_machine,
+)
 from goalgan_bt.viz.view import View
 
 NAMES = "lock", "meta.json.part", "metrics.csv", "ended.txt", "curves.png", "checkpoint.pt"
@@ -551,3 +557,53 @@ def test_uploads_are_kept_by_nobody(view):
     handlers = view.server._websock_server._incoming_handlers
     assert _messages.FileTransferStartUpload not in handlers
     assert _messages.FileTransferPart not in handlers
+
+
+def test_who_sends_too_fast_is_held_up_and_nobody_else(view):
+    import msgspec
+    import viser
+    import websockets.sync.client
+    from viser import _messages
+
+    update = _messages.GuiUpdateMessage("nobody", {"value": 1})
+    nonsense = msgspec.msgpack.encode(update.as_serializable_dict())
+    heard = []
+    handle = view.server._websock_server._handle_incoming_message
+
+    async def count(client, message):
+        heard.append(time.monotonic())
+        await handle(client, message)
+
+    view.server._websock_server._handle_incoming_message = count
+    address = f"ws://127.0.0.1:{view.server.get_port()}"
+    protocols = [f"viser-v{viser.__version__}"]
+    with websockets.sync.client.connect(address, subprotocols=protocols, max_size=None) as browser:
+        for _ in range(int(MESSAGES) + 60):
+            browser.send(nonsense)
+        deadline = time.monotonic() + 20
+        while len(heard) < MESSAGES + 60:
+            assert time.monotonic() < deadline, len(heard)
+            time.sleep(0.05)
+            assert " 200 " in answer(view, b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    assert 0.9 < heard[-1] - heard[0] < 10  # the sixty above what is free at once
+
+
+def test_who_comes_and_goes_too_often_is_refused(view):
+    import viser
+
+    port = view.server.get_port()
+    request = UPGRADE.format(port=port, version=viser.__version__).encode()
+    told = [answer(view, request) for _ in range(MOST_VISITORS)]
+    told += [answer(view, request) for _ in range(2)]  # each refusal takes its time
+    assert any(" 503 " in line for line in told)
+
+
+def test_an_allowance_is_as_counted_by_hand(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("goalgan_bt.viz.server.time.monotonic", lambda: now[0])
+    visits = Allowance(2, 4.0)
+    assert [visits.take() for _ in range(3)] == [True, True, False]
+    now[0] = 0.25
+    assert [visits.take() for _ in range(2)] == [True, False]
+    now[0] = 100.0
+    assert [visits.wait() for _ in range(4)] == [0.0, 0.0, 0.25, 0.5]
