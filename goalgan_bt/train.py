@@ -25,7 +25,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from goalgan_bt.learners.run_config import RunConfig, Trained
+from goalgan_bt.learners.run_config import RunConfig, Trained, World
 from goalgan_bt.learners.table import from_command_line, learner_of
 from goalgan_bt.runs.command_line import run_command
 from goalgan_bt.runs.errors import UsageError
@@ -100,7 +100,7 @@ def run(cfg: RunConfig, module: Any, stop: Stop, begun: Begun) -> Trained:
                 page = page_process.PageProcess(cfg.viz_host, cfg.viz_port)
                 at_last.callback(page.close)
             if folder is None:
-                folder = new_run(cfg.out, world.name, cfg.seed, asdict(cfg), world.maze)
+                folder = new_run(cfg.out, name(cfg, world), cfg.seed, asdict(cfg), world.maze)
             else:
                 check_own(folder)
                 mend_meta(folder, world.maze)
@@ -116,6 +116,12 @@ def run(cfg: RunConfig, module: Any, stop: Stop, begun: Begun) -> Trained:
             if page is not None:
                 page.ended_well = True
         return trained
+
+
+def name(cfg: RunConfig, world: World) -> str:
+    """What a run's folder is called by: the task, and the method where it is not the usual one."""
+    usual = learner_of(cfg.env).preset(cfg.env, None).method
+    return world.name if cfg.method == usual else f"{world.name}-{cfg.method}"
 
 
 def main(argv: list[str] | None = None) -> int:

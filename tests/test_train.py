@@ -3,19 +3,24 @@
 import contextlib
 import os
 import pty
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import conftest
+import msgspec
 import numpy as np
 import pytest
 import torch
+import viser
+import websockets.sync.client
 from conftest import call, run_module, started
+from viser import _messages
 
 from goalgan_bt.envs import maze as mazes
 from goalgan_bt.learners import maze_learner, table
@@ -27,6 +32,7 @@ from goalgan_bt.runs.errors import RunError
 from goalgan_bt.runs.frames import frame_paths, read_frame
 from goalgan_bt.runs.metrics_csv import read_metrics
 from goalgan_bt.runs.signals import Stop
+from goalgan_bt.viz.__main__ import ALONE
 
 TINY = {
     "point_umaze": "--rollout.num-envs 32 --rollout.steps 50 --backtracking.min-transitions 200",
@@ -405,23 +411,59 @@ def test_a_folder_that_becomes_read_only_is_one_line(tmp_path):
 def test_help_shows_defaults_of_the_preset():
     done = call("train", "--env", "point_umaze", "--help")
     assert done.returncode == 0
-    assert "2000000" in done.stdout and "--backtracking.trace-length" in done.stdout
+    assert "2000000" in done.stdout and "four_rooms_N" in done.stdout
+    assert "--backtracking" not in done.stdout and "--help-all" in done.stdout
 
 
-def test_in_a_terminal_the_page_stays_until_ctrl_c(tmp_path):
-    """Ctrl-C after a run that ended well ends the page, silently and well."""
+@pytest.mark.parametrize("env", ["ant_umaze", "point_nd", "four_rooms_15", "hopper"])
+def test_help_is_short_and_all_of_it_is_there_for_who_asks(env):
+    short, whole = (call("train", "--env", env, flag).stdout for flag in ("--help", "--help-all"))
+    assert len(short.splitlines()) < 60
+    said = {word for word in whole.split() if word.startswith("--")}
+    config = table.learner_of(env).config
+    for name, _ in run_folder.flat(asdict(table.from_command_line(["--env", env]))):
+        assert f"--{name.replace('_', '-')}" in {word.rstrip(",") for word in said}, name
+    for name in (f.name for f in fields(config)):
+        flag = "--" + name.replace("_", "-")
+        assert (flag in short.replace(",", " ").split()) == (name in table.OFTEN), name
+
+
+@pytest.mark.parametrize("how", ["Ctrl-C", "alone"])
+def test_in_a_terminal_the_page_stays_while_somebody_looks(tmp_path, how):
+    """Ctrl-C after a run that ended well ends the page, silently and well; so does the last one
+    who looks, so that no shell loop waits for ever."""
     master, slave = pty.openpty()
     flags = "--env", "point_umaze", "--iterations", 1, "--viz", "browser", "--viz-port", 0
     pipes = {"stdin": slave, "stdout": slave, "stderr": subprocess.PIPE}
     with started("train", *words_of(*flags, out=tmp_path), **pipes) as process:
         os.close(slave)
         seen = b""
-        while b"the page stays until Ctrl-C" not in seen:
+        while b"the page stays while somebody looks" not in seen:
             seen += os.read(master, 1000)
-        process.send_signal(signal.SIGINT)
+        if how == "Ctrl-C":
+            process.send_signal(signal.SIGINT)
+        else:
+            port = int(re.search(rb"127.0.0.1:(\d+)", seen)[1])
+            looking = visitor(port)
+            with pytest.raises(subprocess.TimeoutExpired):
+                process.wait(timeout=ALONE + 5)
+            looking.close()
+            while b"nobody looks" not in seen:
+                seen += os.read(master, 1000)
         _, errors = process.communicate(timeout=60)
     os.close(master)
     assert process.returncode == 0 and errors == ""
+
+
+def visitor(port):
+    """A browser's connection to a page."""
+    camera = (1.0, 0, 0, 0), (0.0, 0, 9), 1.0, 0.1, 100.0, 600, 800, (0.0, 0, 0), (0.0, 1, 0)
+    message = _messages.ViewerCameraMessage(*camera).as_serializable_dict()
+    protocols = [f"viser-v{viser.__version__}"]
+    address = f"ws://127.0.0.1:{port}"
+    browser = websockets.sync.client.connect(address, subprotocols=protocols, max_size=None)
+    browser.send(msgspec.msgpack.encode(message))
+    return browser
 
 
 def test_after_an_error_a_launchers_kill_does_not_cut_off_the_last_words():

@@ -8,6 +8,7 @@ if __name__ == "__main__":
 import os
 import sys
 import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -21,7 +22,9 @@ from goalgan_bt.runs.ranges import Range
 from goalgan_bt.runs.run_folder import env_of
 from goalgan_bt.runs.terminal import say
 from goalgan_bt.viz import video
-from goalgan_bt.viz.page_process import free_port
+from goalgan_bt.viz.page_process import UNTIL_ALONE, free_port
+
+ALONE = 15.0  # seconds without a visitor after which nobody looks: more than a reload takes
 
 
 @dataclass(frozen=True)
@@ -56,9 +59,9 @@ def work(argv: list[str] | None) -> None:
     cfg = from_command_line(argv)
     for folder in cfg.runs:
         check(folder)
-    if cfg.with_parent:
-        threading.Thread(target=_wait_for_parent, daemon=True).start()
     if cfg.export is not None or cfg.movie is not None:
+        if cfg.with_parent:
+            threading.Thread(target=_wait_for_parent, daemon=True).start()
         write(cfg)
     else:
         leave_at_once()  # a page has nothing to lose
@@ -88,6 +91,9 @@ def serve(cfg: ViewConfig) -> None:
     from goalgan_bt.viz.view import View
 
     runs = [Run(folder) for folder in cfg.runs]
+    parted = threading.Event()  # the parent has ended well: stay while somebody looks
+    if cfg.with_parent:
+        threading.Thread(target=_wait_for_parent, args=(parted,), daemon=True).start()
     os.nice(19)  # looking must not slow learning; threads take it from the one that starts them
     port = free_port(cfg.host, cfg.port)
     view = View(runs, cfg.host, port)
@@ -97,7 +103,12 @@ def serve(cfg: ViewConfig) -> None:
         say("view: everybody who can reach this machine can use it: there is no password")
     # viser tells of every connection, and who started this may listen no more.
     sys.stdout = open(os.devnull, "w")  # noqa: SIM115
-    view.spin()
+    view.spin(until=parted)
+    last_seen = time.monotonic()
+    while time.monotonic() - last_seen < ALONE:
+        view.spin(seconds=0.5)
+        if view.visitors:
+            last_seen = time.monotonic()
 
 
 def write(cfg: ViewConfig) -> None:
@@ -143,8 +154,11 @@ def from_command_line(argv: list[str] | None = None) -> ViewConfig:
     return cfg
 
 
-def _wait_for_parent() -> None:
-    sys.stdin.read()
+def _wait_for_parent(parted: threading.Event | None = None) -> None:
+    """End when standard input closes, or set the event when it says so."""
+    for line in sys.stdin:
+        if parted is not None and line == UNTIL_ALONE:
+            parted.set()
     os._exit(0)
 
 

@@ -11,12 +11,14 @@ from pathlib import Path
 from goalgan_bt.runs.errors import UsageError
 from goalgan_bt.runs.terminal import complain, say
 
+UNTIL_ALONE = "until alone\n"  # what a page is told that shall stay while somebody looks
+
 
 class PageProcess:
     """A page over a run in a process of its own.
 
-    In a terminal it outlives a training that ended well until Ctrl-C; otherwise it ends with this
-    process, however that ends, so that no script waits for it.
+    In a terminal it outlives a training that ended well for as long as somebody looks, or until
+    Ctrl-C; otherwise it ends with this process, however that ends, so that no script waits for it.
 
     Args:
         host, port: where it shall listen.
@@ -33,16 +35,18 @@ class PageProcess:
         self._place = ["--host", host, "--port", str(port)]
         self._terminal = sys.stdout.isatty()
         self._process: subprocess.Popen[str] | None = None
+        self._folder: Path | None = None
         self._address: str | None = None
         self._known = threading.Event()  # the address, or that there will be none
         self.ended_well = False
 
     def open(self, folder: Path) -> None:
         """Begin to show a run."""
+        self._folder = folder
         command = [sys.executable, "-m", "goalgan_bt.viz", str(folder), *self._place]
         self._process = subprocess.Popen(
-            command if self._terminal else [*command, "--with-parent"],
-            stdin=None if self._terminal else subprocess.PIPE,
+            [*command, "--with-parent"],
+            stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -55,8 +59,13 @@ class PageProcess:
             return
         with contextlib.suppress(KeyboardInterrupt):
             if self._terminal and self.ended_well and self._known.wait(30) and self._address:
-                say(f"the page stays until Ctrl-C: {self._address}")
-                self._process.wait()
+                say(f"the page stays while somebody looks, or until Ctrl-C: {self._address}")
+                assert self._process.stdin is not None
+                with contextlib.suppress(OSError):  # it has ended by itself
+                    self._process.stdin.write(UNTIL_ALONE)
+                    self._process.stdin.flush()
+                if self._process.wait() == 0:
+                    say(f"nobody looks: python -m goalgan_bt.viz {self._folder} opens it again")
         self._process.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout=5)

@@ -5,7 +5,9 @@ browser only puts a request into a queue; nothing that comes from there becomes 
 """
 
 import contextlib
+import math
 import queue
+import threading
 import time
 from functools import partial
 from typing import Any
@@ -78,10 +80,15 @@ class View:
 
     # The loop.
 
-    def spin(self, seconds: float | None = None) -> None:
-        """Keep the page alive, for ever or for some seconds."""
-        end = None if seconds is None else time.monotonic() + seconds
-        while end is None or time.monotonic() < end:
+    @property
+    def visitors(self) -> int:
+        """How many browsers look."""
+        return len(self.server.get_clients())
+
+    def spin(self, seconds: float = math.inf, until: threading.Event | None = None) -> None:
+        """Keep the page alive for some seconds, or until something happens; by default for ever."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end and not (until is not None and until.is_set()):
             begin = time.monotonic()
             self.tick(begin)
             time.sleep(max(0.0, TICK - (time.monotonic() - begin)))
@@ -93,7 +100,7 @@ class View:
         once, if it happens more than once (viser's threads get in each other's way at times).
         """
         tasks = [self._serve_all, self._look_again, self._play_time]
-        if self.server.get_clients():  # otherwise nobody looks
+        if self.visitors:
             tasks.append(self._play_body)
         for task in tasks:
             try:

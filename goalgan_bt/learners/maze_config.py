@@ -32,8 +32,7 @@ class MazeConfig(RunConfig):
     are those of the environment given with --env, or of ant_umaze."""
 
     env: str = "ant_umaze"
-    """Environment: {point,ant}_{umaze,spiral,medium,large}, point_nd, or one's own as
-    module:factory. Picks the preset."""
+    """Environment, of those listed at the end. Picks the learner and its preset."""
     method: str = "recall_traces"
     """What to learn with: recall_traces (over places), recall_traces_paper (over full states);
     without recall goal_gan, gan_fit_all, uniform, feasible, oracle, alp_gmm; controls of the first:

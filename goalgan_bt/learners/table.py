@@ -17,6 +17,12 @@ from goalgan_bt.runs.run_folder import env_of, read_settings
 from goalgan_bt.runs.tracking import require_wandb
 
 DEFAULT = "ant_umaze"
+# What people set: `--help` explains these, of those that a learner has.
+OFTEN = (
+    *("env", "method", "seed", "total_steps", "minutes", "iterations", "map", "dim", "horizon"),
+    *("num_envs", "threads", "physics", "report_every", "out", "resume"),
+    *("viz", "viz_port", "track"),
+)
 
 
 class Learner(NamedTuple):
@@ -114,10 +120,15 @@ def learner_of(env: str) -> Learner:
                 return learner
     except envs.own.OwnEnvError as error:
         raise UsageError(str(error)) from error.__cause__
-    names = [name for learner in LEARNERS for name in learner.names]
-    near = [name for name in names if env and env in name] or get_close_matches(env, names, 2)
+    known = names()
+    near = [name for name in known if env and env in name] or get_close_matches(env, known, 2)
     meant = f"did you mean {' or '.join(near)}? Otherwise " if near else ""
-    raise UsageError(f"unknown environment {env!r}: {meant}choose one of {', '.join(names)}")
+    raise UsageError(f"unknown environment {env!r}: {meant}choose one of {', '.join(known)}")
+
+
+def names() -> list[str]:
+    """The environments of all learners."""
+    return [name for learner in LEARNERS for name in learner.names]
 
 
 def check(cfg: RunConfig) -> None:
@@ -152,7 +163,8 @@ def from_command_line(argv: list[str]) -> Any:
         env = value_of(argv, "--env") or DEFAULT
         learner = learner_of(env)
         default = learner.preset(env, value_of(argv, "--method"))
-    cfg = parse(learner.config, argv, "python -m goalgan_bt.train", default)
+    command, known = "python -m goalgan_bt.train", ", ".join(names())
+    cfg = parse(learner.config, argv, command, default, OFTEN, f"Environments: {known}.\n")
     if run is not None:
         for name in vars(default).keys() - learner.may_change:
             if getattr(cfg, name) != getattr(default, name):

@@ -7,11 +7,13 @@ import os
 import re
 import signal
 import sys
+import typing
 from collections.abc import Callable
+from dataclasses import field, fields, make_dataclass
 from itertools import pairwise
 from pathlib import Path
 from types import FrameType
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import tyro
 
@@ -25,10 +27,18 @@ from goalgan_bt.runs.terminal import complain
 
 T = TypeVar("T")
 FLOATING = re.compile(r"\d+(\.\d+)?[eE]\+?\d{1,2}")
+ALL = "--help-all"
 NO_MEMORY = "out of memory: use smaller settings, for example fewer simulations or smaller networks"
 
 
-def parse(kind: type[T], argv: list[str] | None, prog: str, default: T | None = None) -> T:
+def parse(
+    kind: type[T],
+    argv: list[str] | None,
+    prog: str,
+    default: T | None = None,
+    often: tuple[str, ...] = (),
+    more: str = "",
+) -> T:
     """What a command line asks for.
 
     Args:
@@ -36,21 +46,47 @@ def parse(kind: type[T], argv: list[str] | None, prog: str, default: T | None = 
         argv: its words; those of this process if None.
         prog: how the command is called, for its help.
         default: values of the flags that are not given; else those of the class.
+        often: the flags that `--help` explains; by default all, as `--help-all` always does.
+        more: what the help says at its end.
 
     Raises:
         UsageError: for an unknown flag or a bad value.
-        SystemExit: after `--help`.
+        SystemExit: after `--help` or `--help-all`.
     """
     printed, argv = io.StringIO(), whole_numbers(sys.argv[1:] if argv is None else argv)
     defaults: dict[str, Any] = {} if default is None else {"default": default}
+    asked: Any = kind
+    if ALL in argv:
+        argv = ["--help"]
+    elif often and {"--help", "-h"} & set(argv):
+        argv, asked, defaults = ["--help"], _shortened(kind, default or kind(), often), {}
+        more = f"{more}{ALL} explains every setting, each with its default."
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-            return tyro.cli(kind, args=argv, prog=prog, **defaults)
+            given: T = tyro.cli(asked, args=argv, prog=prog, **defaults)
+            return given
     except SystemExit as stop:
         if not stop.code:  # --help
-            sys.stdout.write(printed.getvalue())
+            lines = printed.getvalue().rstrip().splitlines()
+            sys.stdout.write("\n".join(line.rstrip() for line in [*lines, "", more]).rstrip() + "\n")
             raise
         raise UsageError(_one_line(printed.getvalue())) from None
+
+
+def _shortened(kind: type[T], default: T, often: tuple[str, ...]) -> Any:
+    """The same dataclass with other defaults, of which only some flags are in the help."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    all_fields = [
+        (
+            f.name,
+            hints[f.name] if f.name in often else Annotated[hints[f.name], tyro.conf.Suppress],
+            field(default=getattr(default, f.name)),
+        )
+        for f in fields(typing.cast(Any, kind))
+    ]
+    short = make_dataclass(kind.__name__, all_fields, bases=(kind,), frozen=True)
+    short.__doc__ = kind.__doc__
+    return short
 
 
 def whole_numbers(argv: list[str]) -> list[str]:
@@ -155,10 +191,10 @@ def _one_line(text: str) -> str:
     wrong = re.search(r"Error parsing (--\S+): .*?(?:\['(.+?)'\]|: '(.+?)')", line)
     if wrong:
         value = (wrong[2] or wrong[3]).replace("', '", " ")
-        return f"{wrong[1]} cannot be {value!r}; --help tells what it takes"
+        return f"{wrong[1]} cannot be {value!r}; --help-all tells what it takes"
     line = (
         line.removeprefix("Invalid choice ")
         .removeprefix("Parsing error ")
         .removeprefix("Unrecognized options ")
     )
-    return line.split(" For full helptext")[0][:300] + "; --help lists every setting"
+    return line.split(" For full helptext")[0][:300] + "; --help-all lists every setting"

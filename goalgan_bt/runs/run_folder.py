@@ -1,6 +1,6 @@
 """The run folder: everything a viewer, a plot or a colleague needs, and nothing to unpickle.
 
-runs/<env>-<time>-s<seed>/
+runs/<env>-<time>-s<seed>/    (<env>-<method>-<time>-s<seed> where the method is not the usual one)
     config.json       the resolved settings
     meta.json         versions, git commit, command line, the maze as text; what it was resumed with
     metrics.csv       a row per iteration; columns may be added while it grows
@@ -21,7 +21,7 @@ import sys
 import time
 import types
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from importlib import metadata
 from pathlib import Path
@@ -40,7 +40,7 @@ PACKAGES = ("goalgan_bt", "mujoco", "numpy", "torch", "gymnasium", "gymnasium-ro
 
 
 def create_folder(out: Path, env: str, seed: int) -> Path:
-    """A new, empty run folder `<env>-<time>-s<seed>` in `out`."""
+    """A new, empty run folder `<env>-<time>-s<seed>` in `out`; env may name the method, too."""
     reason: str | None = "all names are taken"
     name = f"{env}-{time.strftime('%Y%m%d-%H%M%S')}-s{seed}"
     for attempt in range(1, 1000):
@@ -154,6 +154,17 @@ def read_settings(kind: type[T], folder: Path) -> T:
         raise RunError(f"{folder} is no run: it has no config.json{inside(folder)}") from None
     except (OSError, ValueError, TypeError, OverflowError) as error:
         raise RunError(f"cannot read {path}: {error}") from None
+
+
+def runs_in(folders: Iterable[Path]) -> list[Path]:
+    """Run folders: those named themselves, and in the place of any other folder the runs in it and
+    in its folders, by name."""
+    found: list[Path] = []
+    for folder in folders:
+        inner = [path.parent for deep in ("*", "*/*") for path in folder.glob(deep + "/config.json")]
+        alone = (folder / "config.json").exists() or not inner
+        found += [folder] if alone else sorted(inner)
+    return list(dict.fromkeys(found))
 
 
 def inside(folder: Path) -> str:

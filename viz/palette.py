@@ -1,0 +1,55 @@
+"""The colours and shapes of page, plots, films and exports, told apart in any light.
+
+Success is viridis: dark for never, bright for always, each step as far from the next to the eye, in
+grey and for the colour-blind as well. Goals differ in shape, rim and lightness, not in hue alone.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from goalgan_bt.envs.maze import FloatArray
+
+RGB = tuple[int, int, int]
+
+SUCCESS = "viridis"  # as matplotlib calls it
+STOPS = np.array(  # of it, evenly spread
+    [
+        *([68, 1, 84], [71, 45, 123], [59, 82, 139], [44, 114, 142], [33, 145, 140]),
+        *([40, 174, 128], [94, 201, 98], [173, 220, 48], [253, 231, 37]),
+    ]
+)
+UNKNOWN = 150  # grey, where nothing is known
+
+
+class Goal(NamedTuple):
+    """How goals of one kind are drawn: shape as viser calls it, marker as matplotlib does."""
+
+    text: str
+    fill: RGB
+    rim: RGB
+    shape: str
+    marker: str
+
+
+GOALS = {  # by label
+    -1: Goal("too hard", (214, 69, 65), (255, 255, 255), "diamond", "D"),
+    0: Goal("intermediate", (255, 255, 255), (20, 20, 20), "circle", "o"),
+    1: Goal("too easy", (150, 158, 172), (20, 20, 20), "square", "s"),
+}
+RUNS = ("#3b7dd8", "#e8871e", "#4aa564", "#c2416b", "#8a63c9", "#7a7a7a")  # one each, and curves
+
+
+def colours(rate: FloatArray) -> NDArray[np.uint8]:
+    """Success in [0, 1], (...), as RGB (..., 3); grey where it is not known."""
+    rate = np.asarray(rate, dtype=float)
+    stops = np.linspace(0, 1, len(STOPS))
+    rgb = np.stack([np.interp(rate, stops, channel) for channel in STOPS.T], axis=-1)
+    rgb[~np.isfinite(rate)] = UNKNOWN
+    return rgb.round().astype(np.uint8)
+
+
+def css(colour: RGB) -> str:
+    """A colour as a browser reads it, and matplotlib."""
+    return "#" + "".join(f"{channel:02x}" for channel in colour)
