@@ -43,7 +43,18 @@ def test_a_command_that_is_none_is_one_line():
 
 @pytest.mark.skipif(not SCRIPT.exists(), reason="needs the package installed")
 def test_the_console_command_trains(tmp_path):
-    words = "train --env point_umaze --iterations 1 --viz none --method uniform --out".split()
+    words = [
+        "train",
+        "--env",
+        "point_umaze",
+        "--iterations",
+        "1",
+        "--viz",
+        "none",
+        "--method",
+        "uniform",
+        "--out",
+    ]
     done = subprocess.run([SCRIPT, *words, tmp_path], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     (folder,) = tmp_path.iterdir()

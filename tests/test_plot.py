@@ -1,4 +1,5 @@
 import json
+import re
 import shutil
 
 import matplotlib.image
@@ -6,6 +7,7 @@ import pytest
 from conftest import call, run_module
 
 from goalgan_bt.runs.frames import frame_paths
+from goalgan_bt.runs.run_folder import runs_in
 from goalgan_bt.viz import pictures
 from goalgan_bt.viz.pictures import _title
 from goalgan_bt.viz.run import Run
@@ -37,7 +39,7 @@ def test_maps_of_chosen_iterations(folder, tmp_path):
     chosen = [f.stem for f in pictures.frames_at(folder, (3, 2, 4))]
     assert chosen == ["000002", "000002", "000004"]
     titles = [ax.get_title() for ax in pictures.overview([folder], at=(2, 4)).axes]
-    assert titles[0].startswith("iteration 2: ") and titles[1].startswith("iteration 4: ")
+    assert titles[0].startswith("iteration 2\n") and titles[1].startswith("iteration 4\n")
     done = plot(folder, "--at", 1, 2, "--out", tmp_path / "c.png")
     assert done.returncode == 0, done.stderr
     assert plot(folder, "--at", 0).returncode == 2
@@ -82,3 +84,62 @@ def test_a_folder_that_is_no_run_is_one_line(run, where, tmp_path):
     done = run("plot", tmp_path / where)
     assert done.returncode == 2
     assert "is no run" in done.stderr and len(done.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
+def test_figures_for_print_have_their_size(folder, tmp_path, kind):
+    path = tmp_path / f"figure.{kind}"
+    done = plot(folder, "--out", path, "--width", 85, "--maps", 2)
+    assert done.returncode == 0, done.stderr
+    data = path.read_bytes()
+    if kind == "png":
+        assert matplotlib.image.imread(path).shape[1] == pytest.approx(85 / 25.4 * 600, abs=2)
+    elif kind == "svg":  # points, and letters that can be changed
+        width = float(re.search(rb'width="([\d.]+)pt"', data)[1])
+        assert width == pytest.approx(85 / 25.4 * 72, abs=0.1) and b"<text" in data
+    else:
+        box = [float(x) for x in re.search(rb"/MediaBox \[([^]]*)\]", data)[1].split()]
+        assert box[2] == pytest.approx(85 / 25.4 * 72, abs=0.1)
+
+
+def test_other_kinds_of_pictures_are_refused(folder, tmp_path):
+    done = plot(folder, "--out", tmp_path / "figure.jpg")
+    assert done.returncode == 2 and ".png or .svg or .pdf" in done.stderr
+    done = plot(folder, "--width", 3)
+    assert done.returncode == 2 and "--width must be between 30 and 1000" in done.stderr
+
+
+def several(folder, out, methods, seeds):
+    """Copies of a run as runs of those methods and seeds, each with other figures."""
+    for method in methods:
+        for seed in range(seeds):
+            copy = shutil.copytree(folder, out / f"{method}-s{seed}")
+            settings = json.loads((copy / "config.json").read_text())
+            (copy / "config.json").write_text(
+                json.dumps(settings | {"method": method, "seed": seed})
+            )
+            table = (copy / "metrics.csv").read_text().splitlines()
+            column = table[0].split(",").index("eval/coverage")
+            rows = [line.split(",") for line in table[1:]]
+            for row in rows:
+                row[column] = row[column] and str(0.1 * seed)
+            (copy / "metrics.csv").write_text("\n".join([table[0], *map(",".join, rows)]) + "\n")
+    return out
+
+
+def test_many_runs_are_a_line_per_method_with_its_interval(folder, tmp_path):
+    out = several(folder, tmp_path / "runs", ("recall_traces", "uniform"), 5)
+    figure = pictures.overview(runs_in([out]), maps=2)
+    curves = next(ax for ax in figure.axes if ax.get_xlabel())
+    named = [line.get_label() for line in curves.lines]
+    assert named[:2] == ["recall_traces (5 seeds)", "uniform (5 seeds)"]
+    assert curves.lines[0].get_ydata() == pytest.approx(0.2)  # the middle of five seeds
+    assert len(curves.collections) == 2 and curves.get_title() == "point_umaze"
+    rows = {ax.get_ylabel() for ax in figure.axes if ax.patches and ax.get_ylabel()}
+    assert rows == {"point_umaze\nrecall_traces\ns0", "point_umaze\nuniform\ns0"}
+
+
+def test_few_runs_of_a_folder_have_a_line_each(folder, tmp_path):
+    out = several(folder, tmp_path / "runs", ("recall_traces", "uniform"), 2)
+    curves = next(ax for ax in pictures.overview(runs_in([out])).axes if ax.get_xlabel())
+    assert len([line for line in curves.lines if "published" not in line.get_label()]) >= 4

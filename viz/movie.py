@@ -47,6 +47,6 @@ def _picture(folder: Path, frame: Path) -> NDArray[np.uint8]:
     image = pictures.coverage_map(left, folder, frame, goals=16)
     left.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=3, frameon=False)
     figure.colorbar(image, ax=left, label="success", shrink=0.8)
-    pictures.curve(right, [folder], until=int(frame.stem))
+    pictures.curve(right, [pictures.measured(folder)], until=int(frame.stem))
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()

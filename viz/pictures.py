@@ -2,75 +2,86 @@
 
 import contextlib
 import math
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib import rc_context, rcParams
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
 
 from goalgan_bt.runs import run_folder
 from goalgan_bt.runs.errors import RunError
 from goalgan_bt.runs.frames import frame_paths, read_frame
 from goalgan_bt.runs.metrics_csv import read_metrics
 from goalgan_bt.runs.terminal import complain
-from goalgan_bt.study.published import Published, published
-from goalgan_bt.viz.run import Run, labels, places, success
+from goalgan_bt.study.published import published
+from goalgan_bt.study.statistics import interval
+from goalgan_bt.viz import palette
+from goalgan_bt.viz.run import Run, drawn, labels, places, success
 
-# Red (never reached) over pale yellow to blue (mastered): readable for colour-blind people.
-COLOURS = "RdYlBu"
-LABELS = {-1: ("too hard", "#a50026"), 0: ("intermediate", "#111111"), 1: ("too easy", "#4575b4")}
+WALL = "#c9cdd3"
+PRINT = {  # for a column of a paper
+    "font.size": 7,
+    "axes.linewidth": 0.5,
+    "lines.linewidth": 1.0,
+    "xtick.major.width": 0.5,
+    "ytick.major.width": 0.5,
+    "pdf.fonttype": 42,  # letters stay letters
+    "svg.fonttype": "none",
+}
+MM = 1 / 25.4  # inches
 
 
-def curve(ax: Axes, folders: list[Path], until: int | None = None) -> None:
-    """Measured coverage over training steps, a line per run, and the published figures; where runs
-    have no coverage, their return.
+def for_print(wanted: bool = True) -> AbstractContextManager[None]:
+    """Inside, figures are drawn and saved as a paper wants them, if that is wanted."""
+    style: Any = PRINT if wanted else {}
+    return rc_context(style)
 
-    Args:
-        ax: where to draw.
-        folders: the runs.
-        until: the last iteration to draw; the axes stay those of the whole run.
+
+class Measured(NamedTuple):
+    """What a run was measured to be worth, in the order of time.
+
+    run; measure: coverage or return; iterations, steps (of training), values: (n,) each;
+    floor: the coverage of a body that does not move, 0 where it is not known.
+    """
+
+    run: Run
+    measure: str
+    iterations: NDArray[np.int64]
+    steps: NDArray[np.int64]
+    values: NDArray[np.float64]
+    floor: float
+
+
+def measured(folder: Path) -> Measured:
+    """What a run was measured to be worth.
 
     Raises:
-        RunError: if a folder is no run, or some have coverage and others not.
+        RunError: if the folder is no run, or its metrics are damaged, or there are none to draw.
     """
-    tables = [read_metrics(folder) for folder in folders]
-    covered = {"eval/coverage" in names or "eval/return" not in names for names, _ in tables}
-    if len(covered) > 1:
-        raise RunError("some of these runs have a coverage, others a return: one at a time")
-    measure = "coverage" if covered == {True} else "return"
-    references: dict[Published, None] = {}  # in the order given
-    for i, (folder, (_, rows)) in enumerate(zip(folders, tables, strict=True)):
-        rows = [row for row in rows if row.get(f"eval/{measure}")]
-        if not rows and run_folder.maze_of(folder) is None:
-            raise RunError(f"{folder} holds no report yet: there is nothing to draw")
-        known = sum(until is None or int(row["iteration"]) <= until for row in rows)
-        try:
-            steps = [int(row["steps/train"]) for row in rows]
-            values = [float(row[f"eval/{measure}"]) for row in rows]
-            if not all(map(math.isfinite, values)):
-                raise ValueError(f"a {measure} is not finite")
-        except ValueError as error:
-            raise RunError(f"{folder / 'metrics.csv'} is damaged: {error}") from None
-        values[known:] = [math.nan] * (len(rows) - known)
-        run = Run(folder)
-        ax.update_datalim([(x, 0.0) for x in steps], updatey=False)
-        ax.plot(steps, values, color=f"C{i}", label=_title(run), marker=".", markersize=4)
-        references |= dict.fromkeys(published(run.settings))
-    for line, grey in zip(references, ("0.65", "0.35") * 9, strict=False):
-        label = f"{line.method} (published)"
-        ax.plot(*zip(*line.points, strict=True), "o--", color=grey, markersize=3, label=label)
-        ax.set_xscale("log")
-    floors = [value for _, rows in tables for value in last_of(rows, "eval/floor") if value > 0]
-    if floors:
-        ax.axhline(min(floors), color="0.6", lw=0.8, ls=":", label="a body that does not move")
-    ax.set(xlabel="environment steps of training", ylabel=measure)
-    if measure == "coverage":
-        ax.set_ylim(0, 1.02)
-    ax.grid(alpha=0.25)
-    ax.legend(fontsize=7, frameon=False, loc="upper left" if measure == "coverage" else "best")
+    names, rows = read_metrics(folder)
+    covered = "eval/coverage" in names or "eval/return" not in names
+    measure = "coverage" if covered else "return"
+    floor = last_of(rows, "eval/floor")
+    rows = [row for row in rows if row.get(f"eval/{measure}")]
+    if not rows and run_folder.maze_of(folder) is None:
+        raise RunError(f"{folder} holds no report yet: there is nothing to draw")
+    try:
+        columns = [[int(row[name]) for row in rows] for name in ("iteration", "steps/train")]
+        values = [float(row[f"eval/{measure}"]) for row in rows]
+        if not all(map(math.isfinite, values)):
+            raise ValueError(f"a {measure} is not finite")
+    except ValueError as error:
+        raise RunError(f"{folder / 'metrics.csv'} is damaged: {error}") from None
+    iterations, steps = (np.array(column, dtype=np.int64) for column in columns)
+    return Measured(
+        Run(folder), measure, iterations, steps, np.array(values), max(floor, default=0)
+    )
 
 
 def last_of(rows: list[dict[str, str]], name: str) -> list[float]:
@@ -79,6 +90,70 @@ def last_of(rows: list[dict[str, str]], name: str) -> list[float]:
         with contextlib.suppress(ValueError):
             return [float(row.get(name) or "")]
     return []
+
+
+def curve(ax: Axes, runs: list[Measured], until: int | None = None) -> None:
+    """What runs were measured to be worth over training steps, a line per run, beside the published
+    figures of their tasks.
+
+    Args:
+        ax: where to draw.
+        runs: of one measure.
+        until: the last iteration to draw; the axes stay those of the whole run.
+
+    Raises:
+        RunError: if some have coverage and others not.
+    """
+    for i, run in enumerate(runs):
+        values = run.values.copy()
+        values[run.iterations > (np.inf if until is None else until)] = np.nan
+        ax.update_datalim([(x, 0.0) for x in run.steps], updatey=False)
+        ax.plot(run.steps, values, color=f"C{i}", label=_title(run.run), marker=".", markersize=4)
+    _around(ax, runs)
+
+
+def curves_of_methods(ax: Axes, methods: dict[str, list[Measured]]) -> None:
+    """The interquartile mean over the seeds of each method, with its 95% bootstrap interval where
+    there are two seeds or more.
+
+    Args:
+        ax: where to draw.
+        methods: runs of one task by method.
+
+    Raises:
+        RunError: if some have coverage and others not.
+    """
+    for i, (method, runs) in enumerate(methods.items()):
+        known = [run for run in runs if len(run.steps)]
+        if not known:
+            continue
+        ends = max(run.steps[0] for run in known), min(run.steps[-1] for run in known)
+        grid = np.linspace(*ends, 150)
+        y = np.array([np.interp(grid, run.steps, run.values) for run in known])
+        bounds = np.array([interval(column) for column in y.T])
+        name = f"{method.replace('$', '')} ({len(known)} seed{'s' * (len(known) > 1)})"
+        ax.plot(grid, bounds[:, 0], color=f"C{i % 10}", label=name)
+        ax.fill_between(grid, *bounds[:, 1:].T, color=f"C{i % 10}", alpha=0.15, lw=0)
+    _around(ax, [run for runs in methods.values() for run in runs])
+
+
+def _around(ax: Axes, runs: list[Measured]) -> None:
+    """What was published for the tasks of these runs, a motionless body's floor, axes, legend."""
+    if len({run.measure for run in runs}) > 1:
+        raise RunError("some of these runs have a coverage, others a return: one at a time")
+    measure = runs[0].measure
+    references = dict.fromkeys(line for run in runs for line in published(run.run.settings))
+    for line, grey in zip(references, ("0.65", "0.35") * 9, strict=False):
+        label = f"{line.method} (published)"
+        ax.plot(*zip(*line.points, strict=True), "o--", color=grey, markersize=3, label=label)
+        ax.set_xscale("log")
+    if floors := [run.floor for run in runs if run.floor > 0]:
+        ax.axhline(min(floors), color="0.6", lw=0.8, ls=":", label="a body that does not move")
+    ax.set(xlabel="environment steps of training", ylabel=measure)
+    if measure == "coverage":
+        ax.set_ylim(0, 1.02)
+    ax.grid(alpha=0.25)
+    ax.legend(fontsize=_small(7), frameon=False, loc="best")
 
 
 def _title(run: Run) -> str:
@@ -109,38 +184,39 @@ def coverage_map(ax: Axes, folder: Path, frame: Path, goals: float = 7.0) -> Any
     if maze is None:
         raise RunError(f"{folder} has no maze to draw: only its curve can be plotted")
     arrays = read_frame(frame)
-    rate, measured = success(arrays)
+    rate, known = success(arrays)
     tiles = arrays["test_goals"]
-    ax.set_facecolor("#55595f")
+    ax.set_facecolor(WALL)
     side = maze.tile_side(len(tiles))
-    image = ax.scatter([], [], c=[], cmap=COLOURS, vmin=0, vmax=1)
-    for (x, y), value in zip(tiles, rate, strict=True):
-        colour = image.to_rgba(value)
+    image = ax.scatter([], [], c=[], cmap=palette.SUCCESS, vmin=0, vmax=1)
+    for (x, y), colour in zip(tiles, palette.colours(rate) / 255, strict=True):
         ax.add_patch(Rectangle((x - side / 2, y - side / 2), side, side, color=colour, lw=0))
     if goals:
         lines = np.swapaxes(places(arrays, "traces", 3)[..., :2], 0, 1)
-        ax.add_collection(LineCollection(list(lines), colors="#111111", linewidths=0.5, alpha=0.5))
-        for label, (text, shade) in LABELS.items():
+        ax.add_collection(LineCollection(list(lines), colors="#ff5a36", linewidths=0.5, alpha=0.7))
+        for label, kind in palette.GOALS.items():
             x, y = arrays["goals"][labels(arrays) == label, :2].T
-            ax.scatter(x, y, s=goals, color=shade, label=text, lw=0.3, edgecolors="white")
+            dots = ax.scatter(x, y, s=goals, marker=kind.marker, label=kind.text, lw=0.4)
+            dots.set(facecolor=palette.css(kind.fill), edgecolor=palette.css(kind.rim))
     ax.plot(0, 0, marker="*", color="white", markeredgecolor="#111111", markersize=9)
-    ax.set(xlim=(maze.low[0], maze.high[0]), ylim=(maze.low[1], maze.high[1]), aspect="equal")
-    ax.set(xticks=[], yticks=[])
-    kind = "coverage" if measured else "estimate"
-    ax.set_title(f"iteration {int(frame.stem)}: {kind} {np.mean(rate):.2f}", fontsize=9)
+    (x0, y0), (x1, y1) = drawn(maze, np.stack([maze.low, maze.high]))
+    ax.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xticks=[], yticks=[])
+    what = "coverage" if known else "estimate"
+    told = f"iteration {int(frame.stem)}\n{what} {np.mean(rate):.2f}"
+    ax.set_title(told, fontsize=_small(9))
     return image
 
 
 def measured_frames(folder: Path) -> list[Path]:
     """The frames that hold a measured coverage, oldest first; one that is damaged is told."""
-    measured = []
+    found = []
     for frame in frame_paths(folder):
         try:
             if success(read_frame(frame))[1]:
-                measured.append(frame)
+                found.append(frame)
         except RunError as error:
             complain(f"{error}: it is left out", "warning")
-    return measured
+    return found
 
 
 def frames_at(folder: Path, iterations: tuple[int, ...]) -> list[Path]:
@@ -155,34 +231,81 @@ def frames_at(folder: Path, iterations: tuple[int, ...]) -> list[Path]:
     return [min(frames, key=lambda frame: abs(int(frame.stem) - i)) for i in iterations if frames]
 
 
-def overview(folders: list[Path], maps: int = 4, at: tuple[int, ...] = ()) -> Figure:
+FEW = 6  # runs, each of which has a line and maps of its own
+
+
+def overview(
+    folders: list[Path], maps: int = 4, at: tuple[int, ...] = (), width: float | None = None
+) -> Figure:
     """A row of coverage maps over training per run, and all curves below.
+
+    Where runs are many they are grouped: a panel of curves for each task, a line for each method,
+    and the maps of the first run of each method.
 
     Args:
         folders: the runs.
         maps: how many measured reports of each run to show, evenly spread.
         at: or the iterations whose reports to show.
+        width: of the figure in millimetres, for print; by default it is made for a screen.
 
     Raises:
         RunError: if a folder is no run or holds no such report yet.
     """
-    maps = len(at) or maps
-    with_maze = [folder for folder in folders if run_folder.maze_of(folder) is not None]
+    runs = [measured(folder) for folder in folders]
+    tasks = by_task_and_method(runs)
+    many = len(runs) > max(FEW, sum(len(methods) for methods in tasks.values()))
+    shown = [of[0] for methods in tasks.values() for of in methods.values()] if many else runs
+    with_maze = [run.run for run in shown if run.run.maze is not None]
     if at and not with_maze:
         raise RunError("--at chooses maps, and these runs have no maze to draw")
-    rows = len(with_maze)
-    figure = Figure(figsize=(2.4 * maps, 2.6 * rows + 3.2), layout="constrained")
-    grid = figure.add_gridspec(rows + 1, maps, height_ratios=[2.6] * rows + [3.2])
-    for r, folder in enumerate(with_maze):
-        frames = frames_at(folder, at) or measured_frames(folder)
-        if not frames:
-            raise RunError(f"{folder} holds no report yet: wait for its first evaluation")
-        picks = np.unique(np.linspace(0, len(frames) - 1, maps).round().astype(int))
-        axes = [figure.add_subplot(grid[r, c]) for c in range(len(picks))]
-        for ax, pick in zip(axes, picks, strict=True):
-            image = coverage_map(ax, folder, frames[pick])
-        axes[0].set_ylabel(_title(Run(folder)).replace(" ", "\n"), fontsize=7)
-        axes[0].legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=3)
-        figure.colorbar(image, ax=axes, label="success", shrink=0.8)
-    curve(figure.add_subplot(grid[rows, :]), folders)
+    columns, panels = len(at) or maps, len(tasks) if many else 1
+    # One for a screen is as large as it needs to be; one for print has the width that is asked for.
+    across = max(2.4 * columns, 5.5 * panels) if width is None else width * MM
+    of_maps = 1.1 * across / columns * len(with_maze) + 0.35 * bool(with_maze)
+    of_curves = max(1.8, 0.55 * across / panels)
+    figure = Figure(figsize=(across, of_maps + of_curves), layout="constrained")
+    heights = [height for height in (of_maps, of_curves) if height]
+    *above, below = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False).flat
+    for part in above:
+        _maps(part, with_maze, columns, at)
+    axes = below.subplots(1, panels, squeeze=False).flat
+    if many:
+        for ax, (task, methods) in zip(axes, tasks.items(), strict=True):
+            curves_of_methods(ax, methods)
+            ax.set_title(task.replace("$", r"\$"), fontsize=rcParams["font.size"])
+    else:
+        curve(axes[0], runs)
     return figure
+
+
+def by_task_and_method(runs: list[Measured]) -> dict[str, dict[str, list[Measured]]]:
+    """Runs by task and method, those of a method by seed."""
+    tasks: dict[str, dict[str, list[Measured]]] = {}
+    for run in sorted(runs, key=lambda run: str(run.run.settings.get("seed", "")).zfill(9)):
+        method = str(run.run.settings.get("method", "?"))
+        tasks.setdefault(run.run.task, {}).setdefault(method, []).append(run)
+    return tasks
+
+
+def _maps(part: SubFigure, runs: list[Run], columns: int, at: tuple[int, ...]) -> None:
+    """Coverage maps, a row for each run."""
+    axes = part.subplots(len(runs), columns, squeeze=False)
+    size = min(7.0, 2.5 * part.figure.get_figwidth() / columns)  # of a goal's dot
+    for row, run in zip(axes, runs, strict=True):
+        frames = frames_at(run.folder, at) or measured_frames(run.folder)
+        if not frames:
+            raise RunError(f"{run.folder} holds no report yet: wait for its first evaluation")
+        picks = np.unique(np.linspace(0, len(frames) - 1, columns).round().astype(int))
+        for ax, pick in zip(row, picks, strict=False):
+            image = coverage_map(ax, run.folder, frames[pick], size)
+        for ax in row[len(picks) :]:
+            ax.set_axis_off()
+        row[0].set_ylabel(_title(run).replace(" ", "\n"), fontsize=_small(7))
+    part.colorbar(image, ax=axes, label="success", shrink=0.8)
+    handles, names = axes[0, 0].get_legend_handles_labels()
+    part.legend(handles, names, loc="outside lower center", ncols=3, fontsize=_small(7))
+
+
+def _small(points: float) -> float:
+    """A size of type, smaller where all type is small."""
+    return min(points, float(rcParams["font.size"]) - 1)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from goalgan_bt.envs.maze import FloatArray
+from goalgan_bt.envs.maze import FloatArray, Maze
 from goalgan_bt.runs import run_folder
 from goalgan_bt.runs.errors import RunError
 from goalgan_bt.runs.frames import frame_paths, read_frame
@@ -125,3 +125,10 @@ def places(frame: Frame, name: str, dims: int) -> FloatArray:
     if array is None or array.ndim != dims or array.dtype.kind != "f" or array.shape[-1] < 2:
         return np.empty((0,) * (dims - 1) + (2,))
     return array
+
+
+def drawn(maze: Maze | None, box: FloatArray) -> FloatArray:
+    """The part of a box of goals, (2, goal_dim), that is drawn, (2, 2): of the outer wall only a
+    strip, since the map is what one wants to see."""
+    hidden = 0.0 if maze is None else 0.75 * maze.cell_size
+    return np.asarray(box)[:, :2] + np.array([[hidden], [-hidden]])

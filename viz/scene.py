@@ -10,7 +10,7 @@ import viser
 from numpy.typing import NDArray
 
 from goalgan_bt.envs.maze import FloatArray, Maze
-from goalgan_bt.viz.run import Frame, labels, of_goals, places, success
+from goalgan_bt.viz.run import Frame, drawn, labels, of_goals, places, success
 
 # Red (never reached) over pale yellow to blue (mastered): ColorBrewer's RdYlBu, made to be told
 # apart by colour-blind people.
@@ -130,13 +130,6 @@ def arrows(places: FloatArray, directions: FloatArray) -> NDArray[np.float32]:
     tails = tip - ahead, tip - 0.35 * ahead + 0.2 * left, tip - 0.35 * ahead - 0.2 * left
     lines = [np.stack([tail, tip], axis=1) for tail in tails]
     return on_floor(np.concatenate(lines), 0.04)
-
-
-def drawn(maze: Maze | None, box: FloatArray) -> FloatArray:
-    """The part of a box of goals, (2, goal_dim), that is drawn, (2, 2): of the outer wall only a
-    strip, since the map is what one wants to see."""
-    hidden = 0.0 if maze is None else 0.75 * maze.cell_size
-    return np.asarray(box)[:, :2] + np.array([[hidden], [-hidden]])
 
 
 class Scene:

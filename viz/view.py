@@ -22,8 +22,8 @@ from goalgan_bt.viz.captions import caption, plain, settings_table, state
 from goalgan_bt.viz.curves import Curves
 from goalgan_bt.viz.download import Export, as_csv
 from goalgan_bt.viz.player import Attempt, Player
-from goalgan_bt.viz.run import Frame, Run
-from goalgan_bt.viz.scene import LAYERS, Scene, drawn, legend, look_at
+from goalgan_bt.viz.run import Frame, Run, drawn
+from goalgan_bt.viz.scene import LAYERS, Scene, legend, look_at
 from goalgan_bt.viz.server import start_server
 
 LOOK_EVERY = 1.0  # seconds between two looks at the run folders

@@ -68,7 +68,9 @@ def parse(
     except SystemExit as stop:
         if not stop.code:  # --help
             lines = printed.getvalue().rstrip().splitlines()
-            sys.stdout.write("\n".join(line.rstrip() for line in [*lines, "", more]).rstrip() + "\n")
+            sys.stdout.write(
+                "\n".join(line.rstrip() for line in [*lines, "", more]).rstrip() + "\n"
+            )
             raise
         raise UsageError(_one_line(printed.getvalue())) from None
 

@@ -161,7 +161,9 @@ def runs_in(folders: Iterable[Path]) -> list[Path]:
     in its folders, by name."""
     found: list[Path] = []
     for folder in folders:
-        inner = [path.parent for deep in ("*", "*/*") for path in folder.glob(deep + "/config.json")]
+        inner = [
+            path.parent for deep in ("*", "*/*") for path in folder.glob(deep + "/config.json")
+        ]
         alone = (folder / "config.json").exists() or not inner
         found += [folder] if alone else sorted(inner)
     return list(dict.fromkeys(found))
