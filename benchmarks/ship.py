@@ -15,6 +15,7 @@ import numpy as np
 
 from goalgan_bt.runs import checkpoint
 from goalgan_bt.runs.frames import frame_paths
+from goalgan_bt.runs.policies import policy_alone
 
 REPORTS = 24  # evenly spread over the run
 PRIVATE = "--out", "--map"  # flags that name a path of the machine
@@ -44,9 +45,7 @@ def ship(run: Path, out: Path) -> None:
     for i in np.unique(np.linspace(0, len(frames) - 1, REPORTS).round().astype(int)):
         shutil.copy(frames[i], out / "frames" / frames[i].name)
     with checkpoint.saved(run) as state:
-        learner = {name: state["learner"][name] for name in ("policy", "places")}
-        kept = {"learner": learner, "run": {"iteration": state["run"]["iteration"]}}
-    checkpoint.save(kept, out / "checkpoint.pt")
+        checkpoint.save(policy_alone(state), out / "checkpoint.pt")
 
 
 if __name__ == "__main__":

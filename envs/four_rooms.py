@@ -71,6 +71,13 @@ class FourRooms:
                     self.predecessors[following, action, self.ways[following, action]] = state
                     self.ways[following, action] += 1
 
+    @property
+    def rows(self) -> tuple[str, ...]:
+        """The map as text: '#' wall, '.' free, 'S' start."""
+        text = np.where(self.free, ".", "#")
+        text[tuple(self.cells[self.start])] = "S"
+        return tuple("".join(row) for row in text)
+
     def picture(self, of_states: NDArray[Any]) -> NDArray[np.float64]:
         """A value per state, (S,), laid out on the grid, (size, size); NaN in the walls."""
         grid = np.full(self.free.shape, np.nan)

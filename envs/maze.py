@@ -170,8 +170,20 @@ class Maze:
     @cached_property
     def longest_path(self) -> int:
         """Steps from the start cell to the free cell farthest from it."""
-        distance = _distances(self.free, self._start)
-        return int(distance[self.free].max())
+        return int(self._steps.max())
+
+    @cached_property
+    def _steps(self) -> NDArray[np.int64]:
+        """Steps from the start cell to each cell, -1 to walls."""
+        return _distances(self.free, self._start)
+
+    def way_from_start(self, xy: FloatArray) -> FloatArray:
+        """How far it is from the start to places, (n, 2) -> (n,) metres, along the corridors and
+        counted in cells; NaN in walls."""
+        column, row = self._cell(xy - self.low).T
+        steps = self._steps[row, column].astype(float)
+        steps[steps < 0] = np.nan
+        return self.cell_size * steps
 
     def slide(self, before: Array, after: Array, radius: float) -> tuple[Array, Array]:
         """Stop a body at the walls, letting it slide along them.

@@ -96,7 +96,7 @@ def run(cfg: RunConfig, module: Any, stop: Stop, begun: Begun) -> Trained:
     with contextlib.ExitStack() as at_last, module.prepared(cfg) as world:
         folder, page = cfg.resume, None
         if records():
-            if cfg.viz == "browser" and learner_of(cfg.env).has_map:
+            if cfg.viz == "browser":
                 page = page_process.PageProcess(cfg.viz_host, cfg.viz_port)
                 at_last.callback(page.close)
             if folder is None:

@@ -23,6 +23,7 @@ from goalgan_bt.runs import run_folder
 from goalgan_bt.runs.errors import RunError
 from goalgan_bt.runs.frames import read_frame
 from goalgan_bt.runs.metrics_csv import Metrics
+from goalgan_bt.runs.policies import kept_policies
 from goalgan_bt.runs.run_writer import RunWriter
 from goalgan_bt.study.published import published
 from goalgan_bt.viz.captions import settings_table, state
@@ -30,7 +31,7 @@ from goalgan_bt.viz.curves import joined, thinned
 from goalgan_bt.viz.download import as_csv
 from goalgan_bt.viz.player import Player
 from goalgan_bt.viz.run import Run, success
-from goalgan_bt.viz.scene import ARROW, arrows, colours, segments, tile_image
+from goalgan_bt.viz.scene import ARROW, arrows, segments, tile_image
 from goalgan_bt.viz.view import View, report_at
 
 
@@ -144,12 +145,6 @@ def test_ten_thousand_frames_are_listed_fast_and_not_all_kept(folder):
 # What it draws.
 
 
-def test_colours_run_from_red_to_blue_and_grey_is_unknown():
-    red, blue, grey = colours(np.array([0.0, 1.0, np.nan])).astype(int)
-    assert red[0] > 150 > red[2] and blue[2] > 140 > blue[0]
-    assert grey[0] == grey[1] == grey[2]
-
-
 def test_each_tile_lies_where_it_is_on_the_map():
     """The one mastered tile is where it belongs: x to the right, y up, in any order of tiles."""
     maze = mazes.layout("umaze")
@@ -159,7 +154,7 @@ def test_each_tile_lies_where_it_is_on_the_map():
         rate = np.zeros(len(tiles))
         rate[mastered] = 1.0
         image = tile_image(maze, tiles[order], rate[order]).astype(int)
-        rows, columns = np.nonzero((image[..., 2] > image[..., 0]) & (image[..., 3] > 0))
+        rows, columns = np.nonzero((image[..., 0] > 200) & (image[..., 3] > 0))
         height, width = image.shape[:2]
         x = maze.low[0] + (columns.mean() + 0.5) / width * (maze.high - maze.low)[0]
         y = maze.high[1] - (rows.mean() + 0.5) / height * (maze.high - maze.low)[1]
@@ -183,7 +178,7 @@ def test_curves_are_thinned_to_their_ends_and_joined_over_gaps():
 
 
 def test_the_last_report_is_on_show_and_follows_the_run(view, folder):
-    assert "Iteration 4" in view._caption.content and "measured" in view._caption.content
+    assert "Iteration 4" in view.panel.caption.content and "measured" in view.panel.caption.content
     before = node(view, "/run0/coverage/node").image.copy()
     RunWriter(folder, 4)
     frame = dict(read_frame(folder / "frames/000004.npz"))
@@ -191,25 +186,25 @@ def test_the_last_report_is_on_show_and_follows_the_run(view, folder):
     RunWriter(folder, 4).frame(6, **frame)
     view._last_look = 0.0
     view.tick(time.monotonic())
-    assert "Iteration 6" in view._caption.content
+    assert "Iteration 6" in view.panel.caption.content
     assert not np.array_equal(before, node(view, "/run0/coverage/node").image)
 
 
 def test_going_back_shows_the_past_until_one_follows_again(view, folder):
-    view._follow.value = False
+    view.panel.follow.value = False
     view._ask("slider", 0)
     view.tick(time.monotonic())
-    assert "Iteration 1 " in view._caption.content
+    assert "Iteration 1 " in view.panel.caption.content
     shutil.copy(folder / "frames/000004.npz", folder / "frames/000009.npz")
     view._look()
-    assert "Iteration 1 " in view._caption.content
-    view._follow.value = True
+    assert "Iteration 1 " in view.panel.caption.content
+    view.panel.follow.value = True
     view._look()
-    assert "Iteration 9" in view._caption.content
+    assert "Iteration 9" in view.panel.caption.content
 
 
 def test_playing_goes_through_all_reports(view):
-    view._play.value, view._speed.value = True, 20
+    view.panel.play.value, view.panel.speed.value = True, 20
     seen, end = set(), time.monotonic() + 5
     while time.monotonic() < end and len(seen) < 4:
         view.tick(time.monotonic())
@@ -242,7 +237,7 @@ def test_the_page_outlives_its_folder(view, folder):
     view._look()
     view._ask("goal", [0.0, 0.0])
     view.tick(time.monotonic())
-    assert "is gone" in view._status.content
+    assert "is gone" in view.panel.status.content
 
 
 def test_several_runs_stand_side_by_side(trained, folder):
@@ -250,10 +245,10 @@ def test_several_runs_stand_side_by_side(trained, folder):
         (folder / f"frames/{i:06d}.npz").unlink()  # the first is behind the second
     view = View([Run(folder), Run(trained)], port=0)
     assert node(view, "/run1").position[0] > node(view, "/run0").position[0] + 6
-    assert view._slider.max == 3 and "Iteration 4" in view._caption.content
+    assert view.panel.slider.max == 3 and "Iteration 4" in view.panel.caption.content
     pictures = [node(view, f"/run{i}/coverage/node").image.copy() for i in range(2)]
     assert not np.array_equal(*pictures)
-    view._follow.value = False
+    view.panel.follow.value = False
     view._ask("slider", 0)
     view.tick(time.monotonic())
     assert np.array_equal(node(view, "/run0/coverage/node").image, pictures[0])
@@ -269,9 +264,9 @@ def test_what_stands_in_a_folder_is_shown_as_text(folder):
     (evil / "config.json").write_text(json.dumps(settings))
     run = Run(evil)
     view = View([run], port=0)
-    for text in (view._status.content, settings_table(run.settings)):
+    for text in (view.panel.status.content, settings_table(run.settings)):
         assert not set("<>![]`#") & set(text.replace("&#", ""))
-    assert "c&#42;&#42;" in view._status.content
+    assert "c&#42;&#42;" in view.panel.status.content
     view.close()
 
 
@@ -293,7 +288,7 @@ def test_no_file_ends_the_page(folder, file, text):
     view._ask("all", None)
     for _ in range(3):
         view.tick(time.monotonic())
-    assert "Iteration" in view._caption.content and not view._trouble
+    assert "Iteration" in view.panel.caption.content and not view._trouble
     view.close()
 
 
@@ -314,7 +309,7 @@ def test_a_run_without_walls_is_shown(tmp_path):
     view = View([Run(tmp_path)], port=0)
     view._ask("all", None)
     view.tick(time.monotonic())
-    assert "All tiles" in view._describe_attempt(time.monotonic()) and not view._trouble
+    assert "All tiles" in view.panel.outcome.content and not view._trouble
     view.close()
 
 
@@ -334,27 +329,66 @@ def test_a_click_leads_to_an_attempt_with_an_outcome(view):
     view._ask("goal", np.array([0.2, 0.0]))  # within reach from the first moment
     view.tick(time.monotonic())
     end = time.monotonic() + 30
-    while "reached" not in view._outcome.content and time.monotonic() < end:
+    while "reached** after" not in view.panel.outcome.content and time.monotonic() < end:
         view._play_body(time.monotonic())
-    assert "Goal (0.2, 0.0): **reached** after" in view._outcome.content
+    assert "Goal (0.2, 0.0): **reached** after" in view.panel.outcome.content
 
 
-def test_ring_and_verdict_stay_until_the_body_goes_elsewhere(view):
+def test_ring_trail_and_verdict_stay_until_the_next_wish(view):
     view._ask("goal", np.array([0.2, 0.0]))
     now = time.monotonic()
     view.tick(now)
-    attempt = view._attempt
-    view._play_body(now + attempt.seconds + 20)
-    assert view._attempt is attempt and "**reached** after" in view._outcome.content
-    view._play_body(now + attempt.seconds + 40)
-    assert view._attempt is not attempt and "of its own again" in view._outcome.content
+    attempt = view.stage._attempt
+    view._play_body(now + attempt.seconds + 3600)
+    assert view.stage._attempt is attempt and "**reached** after" in view.panel.outcome.content
+    trail = node(view, "/run0/body/trail").points
+    assert len(trail) == attempt.ends[0] and trail[0, 0, :2] == pytest.approx(0)
+    assert (
+        np.linalg.norm(node(view, "/run0/body/goal").points[..., :2] - [0.2, 0], axis=-1)
+    ).max() < 0.31
+    view._ask("release", None)
+    view.tick(now)
+    view._play_body(now)
+    assert view.stage._attempt is not attempt and not view.stage.asked
 
 
-def test_an_old_report_says_whose_body_it_is(view):
-    view._show(0)
-    assert "the newest policy" in view._caption.content
+def test_a_click_tells_what_is_known_of_the_place(view, folder):
+    frame = read_frame(folder / "frames/000004.npz")
+    tile = int(np.linalg.norm(frame["test_goals"] - [0.2, 0.1], axis=1).argmin())
+    frame["goals"][:] = 3.9
+    frame["goals"][7] = 0.2, 0.2
+    frame["label"][7] = 1
+    frame["coverage"][tile] = 0.37
+    RunWriter(folder, 4).frame(4, **frame)
+    view._look()
+    view._ask("goal", np.array([0.2, 0.1]))
+    view.tick(time.monotonic())
+    told = view.panel.outcome.content
+    assert "This tile is reached in **37%** (measured)" in told
+    assert "The goal beside it is too easy" in told
+
+
+def test_tried_tiles_are_coloured_as_they_end(view):
+    view._ask("all", None)
+    now = time.monotonic()
+    view.tick(now)
+    attempt = view.stage._attempt
+    picture = lambda: node(view, "/run0/tried/node").image  # noqa: E731
+    first = attempt.ends.min() * attempt.dt
+    view._play_body(view.stage._began + first - 0.5 * attempt.dt)
+    assert not picture()[..., 3].any()
+    view._play_body(view.stage._began + attempt.seconds + 1)
+    maze, goals = view.runs[0].maze, attempt.goals
+    assert np.array_equal(picture(), tile_image(maze, goals, attempt.reached.astype(float)))
+
+
+def test_the_body_is_that_of_the_report_on_show(view, folder):
+    kept = [int(path.stem) for path in kept_policies(folder)]
+    assert kept[-1] == 4 and len(kept) >= 2
+    view._show(kept[0] - 1)
+    assert view.stage.ready(time.monotonic()) and view.stage._player.iteration == kept[0]
     view._show(3)
-    assert "newest policy" not in view._caption.content
+    assert view.stage.ready(time.monotonic()) and view.stage._player.iteration == 4
 
 
 def test_the_status_says_when_coverage_was_measured(folder):
@@ -390,7 +424,7 @@ def test_arrows_lead_to_the_goal_that_was_set_and_to_none_of_many(view, monkeypa
     view._ask("goal", np.array([0.2, 0.0]))
     view.tick(time.monotonic())
     places, directions = drawn[-1]
-    assert len(places) == len(view._player.env.test_goals())
+    assert len(places) == len(view.stage._player.env.test_goals())
     assert np.linalg.norm(directions, axis=1) == pytest.approx(1)
     near = np.linalg.norm(places - [0.2, 0.0], axis=1) < 0.4
     cosines = (directions * ([0.2, 0.0] - places)).sum(axis=1)[near]
@@ -411,15 +445,15 @@ def test_how_an_attempt_ended_is_told_however_late(view):
     now = time.monotonic()
     view.tick(now)
     view._play_body(now)
-    assert "on its way" in view._outcome.content
-    view._play_body(now + view._attempt.seconds + 25)  # a busy machine, or nobody looked
-    assert "Goal (0.2, 0.0): **reached** after" in view._outcome.content
+    assert "on its way" in view.panel.outcome.content
+    view._play_body(now + view.stage._attempt.seconds + 25)  # a busy machine, or nobody looked
+    assert "Goal (0.2, 0.0): **reached** after" in view.panel.outcome.content
 
 
 def test_a_click_into_a_wall_is_answered(view):
     view._ask("goal", np.array([0.0, 2.0]))
     view.tick(time.monotonic())
-    assert "free place" in view._outcome.content
+    assert "free place" in view.panel.outcome.content
 
 
 def test_without_a_policy_it_says_so(folder):
@@ -427,7 +461,7 @@ def test_without_a_policy_it_says_so(folder):
     view = View([Run(folder)], port=0)
     view._ask("all", None)
     view.tick(time.monotonic())
-    assert "no policy to play" in view._outcome.content
+    assert "no policy to play" in view.panel.outcome.content
     view.close()
 
 
@@ -522,19 +556,19 @@ def test_nonsense_from_a_browser_changes_no_file_and_ends_nothing(view, folder):
             view.tick(time.monotonic())
             time.sleep(0.01)
     assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before
-    view._follow.value = True
+    view.panel.follow.value = True
     view._look()
-    assert "Iteration 4" in view._caption.content
+    assert "Iteration 4" in view.panel.caption.content
 
 
 def test_many_wishes_are_one_attempt(view, monkeypatch):
     begun = []
-    monkeypatch.setattr(view, "_begin", begun.append)
+    monkeypatch.setattr(view.stage, "ask", lambda place, now: begun.append(place))
     for _ in range(50):
         view._ask("all", None)
     view._ask("goal", np.array([0.2, 0.0]))
     view.tick(time.monotonic())
-    assert [goals.shape for goals in begun] == [(1, 2)]
+    assert [place.tolist() for place in begun] == [[0.2, 0.0]]
 
 
 # The command.

@@ -9,21 +9,21 @@ import os
 import sys
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from goalgan_bt.learners.table import learner_of
 from goalgan_bt.runs.command_line import check_ranges, check_target, parse, run_command
 from goalgan_bt.runs.errors import UsageError
 from goalgan_bt.runs.ranges import Range
-from goalgan_bt.runs.run_folder import env_of
+from goalgan_bt.runs.run_folder import runs_in
 from goalgan_bt.runs.terminal import say
 from goalgan_bt.viz import video
 from goalgan_bt.viz.page_process import UNTIL_ALONE, free_port
 
+MOST_RUNS = 16  # side by side
 ALONE = 15.0  # seconds without a visitor after which nobody looks: more than a reload takes
 
 
@@ -32,7 +32,8 @@ class ViewConfig:
     """Watch runs in a browser, live or afterwards; nothing in the folders is changed."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Run folders: one in full, or several side by side."""
+    """Run folders, or folders of runs, of which all runs are taken: one run in full, or up to 16
+    side by side."""
     host: str = "127.0.0.1"
     """Where to listen; 0.0.0.0 lets everybody on the network in, without a password."""
     port: Annotated[int, Range("between 0 and 65535", 0, 65535)] = 8080
@@ -57,8 +58,6 @@ def work(argv: list[str] | None) -> None:
         UsageError, RunError, OSError: saying what is wrong.
     """
     cfg = from_command_line(argv)
-    for folder in cfg.runs:
-        check(folder)
     if cfg.export is not None or cfg.movie is not None:
         if cfg.with_parent:
             threading.Thread(target=_wait_for_parent, daemon=True).start()
@@ -66,17 +65,6 @@ def work(argv: list[str] | None) -> None:
     else:
         leave_at_once()  # a page has nothing to lose
         serve(cfg)
-
-
-def check(folder: Path) -> None:
-    """See that there will be a map to look at.
-
-    Raises:
-        UsageError: if the run's learner draws none.
-    """
-    env = env_of(folder)
-    if env and not learner_of(env).has_map:
-        raise UsageError(f"{env} has no map: python -m goalgan_bt.plot draws the run's curve")
 
 
 def serve(cfg: ViewConfig) -> None:
@@ -91,6 +79,7 @@ def serve(cfg: ViewConfig) -> None:
     from goalgan_bt.viz.view import View
 
     runs = [Run(folder) for folder in cfg.runs]
+    runs.sort(key=lambda run: (run.task, str(run.settings.get("method", ""))))  # stable
     parted = threading.Event()  # the parent has ended well: stay while somebody looks
     if cfg.with_parent:
         threading.Thread(target=_wait_for_parent, args=(parted,), daemon=True).start()
@@ -146,6 +135,9 @@ def from_command_line(argv: list[str] | None = None) -> ViewConfig:
     cfg = parse(ViewConfig, argv, "python -m goalgan_bt.viz")
     if not cfg.runs:
         raise UsageError("name at least one run folder: python -m goalgan_bt.viz RUN")
+    cfg = replace(cfg, runs=tuple(runs_in(cfg.runs)))
+    if len(cfg.runs) > MOST_RUNS:
+        raise UsageError(f"a page shows at most {MOST_RUNS} runs, and there are {len(cfg.runs)}")
     if len(cfg.runs) > 1 and (cfg.export is not None or cfg.movie is not None):
         raise UsageError("--export and --movie show one run: name only one")
     if not cfg.host:

@@ -9,6 +9,8 @@ from mjviser import ViserMujocoScene
 
 from goalgan_bt.envs.maze import FloatArray
 
+MOVING, FIXED = "/bodies", "/fixed_bodies"  # as mjviser calls them
+POINTS = "/points"
 HIDDEN = 3  # a geom group that mjviser does not show
 
 
@@ -18,11 +20,17 @@ class Bodies:
     Args:
         server: whose scene it is.
         model: the MuJoCo model, or None: then states begin with the position of a point mass.
-        node: name of the node of the point masses.
+        offset: (x, y) of their world in the scene, metres; None: the first body is kept in the
+            middle, as on a treadmill.
     """
 
-    def __init__(self, server: viser.ViserServer, model: mujoco.MjModel | None, node: str) -> None:
-        self._server, self._node = server, node
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        model: mujoco.MjModel | None,
+        offset: tuple[float, float] | None = (0.0, 0.0),
+    ) -> None:
+        self._server, self._offset, self._middle = server, offset, (0.0, 0.0)
         self._model = None if model is None else copy.copy(model)
         if self._model is None:
             return
@@ -30,19 +38,32 @@ class Bodies:
         self._data = mujoco.MjData(self._model)
         self._scene = ViserMujocoScene(server, self._model, 1)
         self._scene.camera_tracking_enabled = False  # world coordinates, as all other layers
-        self._switch("/fixed_bodies", False)  # walls and floor: `Scene` draws them
+        self._switch(FIXED, False)  # walls and floor: `Scene` draws them
+        self._move(offset or (0.0, 0.0))
 
     def show(self, visible: bool) -> None:
         """Show or hide the bodies."""
-        self._switch("/bodies" if self._model is not None else self._node, visible)
+        self._switch(MOVING if self._model is not None else POINTS, visible)
+
+    def remove(self) -> None:
+        """Take them out of the scene."""
+        for name in (MOVING, FIXED, POINTS):
+            node = self._server.scene.get_handle_by_name(name)
+            if node is not None:
+                node.remove()
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """Where the first body is that is kept in the middle, (x, y) metres."""
+        return self._middle
 
     def draw(self, states: FloatArray) -> None:
         """Put the bodies into these states, (n, state_dim)."""
         if self._model is None:
             points = np.zeros((len(states), 3), dtype=np.float32)
-            points[:, :2], points[:, 2] = states[:, :2], 0.1
+            points[:, :2], points[:, 2] = states[:, :2] + (self._offset or (0, 0)), 0.1
             self._server.scene.add_point_cloud(
-                self._node, points, (230, 90, 40), point_size=0.2, point_shape="circle"
+                POINTS, points, (230, 90, 40), point_size=0.2, point_shape="circle"
             )
             return
         xpos = np.zeros((len(states), self._model.nbody, 3))
@@ -52,6 +73,15 @@ class Bodies:
             mujoco.mj_kinematics(self._model, self._data)
             xpos[i], xmat[i] = self._data.xpos, self._data.xmat.reshape(-1, 3, 3)
         self._scene.update_from_arrays(xpos, xmat)
+        if self._offset is None:
+            x, y = xpos[0, 1, :2]  # the root
+            self._middle = float(x), float(y)
+            self._move((-x, -y))
+
+    def _move(self, offset: tuple[float, float]) -> None:
+        node = self._server.scene.get_handle_by_name(MOVING)
+        if node is not None:
+            node.position = (*offset, 0.0)
 
     def _switch(self, name: str, visible: bool) -> None:
         node = self._server.scene.get_handle_by_name(name)

@@ -7,7 +7,7 @@ import numpy as np
 
 from goalgan_bt.runs.metrics_csv import Metrics
 from goalgan_bt.runs.run_folder import flat
-from goalgan_bt.viz.run import Run, success
+from goalgan_bt.viz.run import Frame, Run, labels, success, visits
 
 SILENT = 120.0  # seconds without news after which a run counts as stopped
 
@@ -41,6 +41,61 @@ def state(run: Run) -> str:
     return f"{'learns' if learns else 'is silent'}: {progress}"
 
 
+def doing(run: Run) -> str:
+    """What a run is about at the moment, in a sentence or two for who has never seen one."""
+    metrics, over = run.metrics, run.ended() == "complete"
+    if run.kind == "running":
+        value = _last_known(metrics, "eval/return")
+        told = "" if value != value else f"; its last measured return is {value:,.0f}"
+        return f"{'A body has learned' if over else 'A body learns'} to run{told}."
+    if run.kind == "rooms":
+        value = _last_known(metrics, "eval/coverage")
+        told = "" if value != value else f" It finds it in {value:.0%} of its tries."
+        return f"An agent looks for the goal, which is in the far one of four rooms.{told}"
+    covered, _ = measured(metrics)
+    if covered != covered:
+        covered = _last_known(metrics, "curriculum/estimated_coverage")
+    world = "box" if run.maze is None else "maze"
+    known = "" if covered != covered else f"It reaches **{covered:.0%}** of the {world}"
+    if over:
+        return f"A body has learned to go through this {world}. {known}: click anywhere to see."
+    frame = run.frame(run.iterations[-1]) if run.iterations else None
+    if frame is None or not len(frame["goals"]):
+        return f"A body learns to reach every place of this {world}. It has just begun."
+    what = practised(run, frame)
+    return f"A body learns to reach every place of this {world}. {what}" + (
+        f" {known}." if known else ""
+    )
+
+
+def practised(run: Run, frame: Frame) -> str:
+    """Which goals are tried in a report, and how that goes."""
+    kinds, goals = labels(frame), np.asarray(frame["goals"], dtype=float)
+    some = goals[kinds == 0] if (kinds == 0).any() else goals
+    if run.maze is not None:
+        far = run.maze.way_from_start(some[:, :2])
+        end = run.maze.cell_size * run.maze.longest_path
+        whole = f"the farthest place of the maze is {end:.0f} m away"
+    else:
+        far = np.linalg.norm(some, axis=1)
+        whole = "as the crow flies"
+    far = far[np.isfinite(far)]
+    if not len(far):
+        return "It tries goals that no body can reach, for now."
+    near, most = np.percentile(far, [10, 90])
+    where = f"{near:.0f} m" if round(near) == round(most) else f"{near:.0f} to {most:.0f} m"
+    success = _last_known(run.metrics, "rollout/success")
+    told = "" if success != success else f" and reaches {success:.0%} of its goals"
+    return f"Now it practises {where} from the start ({whole}){told}."
+
+
+def _last_known(metrics: Metrics, name: str) -> float:
+    """The last value of a metric that is known, else NaN."""
+    column = metrics.column(name)
+    known = np.flatnonzero(np.isfinite(column))
+    return float(column[known[-1]]) if len(known) else np.nan
+
+
 def measured(metrics: Metrics) -> tuple[float, float]:
     """The last coverage that was measured, and after how many steps; NaN if none was."""
     known = np.flatnonzero(np.isfinite(metrics.column("eval/coverage")))
@@ -55,7 +110,9 @@ def caption(run: Run, iteration: int) -> str:
     words = [f"Iteration {iteration:,}"]
     if steps == steps:
         words.append(f"{steps:,.0f} steps")
-    if frame is not None:
+    if frame is not None and run.kind == "rooms":
+        words.append(f"{np.mean(visits(frame) > 0):.0%} of the cells visited")
+    elif frame is not None:
         rate, measured = success(frame)
         kind = "coverage (measured)" if measured else "coverage (estimated)"
         words.append(f"{kind} **{np.mean(rate) if len(rate) else np.nan:.2f}**")

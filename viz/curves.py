@@ -1,6 +1,6 @@
 """The curves of the panel, drawn by uPlot in the browser."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,10 +10,10 @@ from viser import uplot
 from goalgan_bt.envs.maze import FloatArray
 from goalgan_bt.recall.settings import DEPTHS
 from goalgan_bt.study.published import published
+from goalgan_bt.viz.palette import RUNS
 from goalgan_bt.viz.run import Run
 
 MOST = 400  # points of a curve that are sent to the page
-COLOURS = ("#3b7dd8", "#e8871e", "#4aa564", "#c2416b", "#8a63c9", "#7a7a7a")
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Plot:
     share: bool = False  # whether all values lie between 0 and 1
 
 
-PLOTS = (
+OF_GOALS = (
     Plot(
         "Coverage",
         (
@@ -90,6 +90,27 @@ PLOTS = (
 )
 
 
+OF_ROOMS = (
+    Plot("Success from the start", (("eval/coverage", "measured"),), share=True),
+    Plot("Discounted return", (("eval/return", "measured"),)),
+    Plot(
+        "States visited",
+        (("train/states", "in training so far"), ("eval/states", "by the trained policy")),
+    ),
+)
+OF_RUNNING = (
+    Plot("Return of an episode", (("eval/return", "measured"),)),
+    Plot(
+        "Backtracking model, -log likelihood of steps, nats",
+        (("recall/action_nll", "q(a | s')"), ("recall/state_nll", "q(ds | a, s')")),
+    ),
+    Plot("Recall traces: share of valid steps", (("recall/valid", "valid"),), share=True),
+    Plot("Imitation: KL, nats", (("recall/kl", "KL"),)),
+    Plot("Environment steps per second", (("time/fps", "training"),)),
+)
+PLOTS = {"goals": OF_GOALS, "rooms": OF_ROOMS, "running": OF_RUNNING}
+
+
 def thinned(n: int) -> np.ndarray:
     """At most `MOST` of n rows, evenly spread, the last one always among them."""
     return np.unique(np.linspace(0, n - 1, min(n, MOST)).round().astype(int))
@@ -120,12 +141,13 @@ def levels(run: Run, plot: Plot) -> list[tuple[str, float]]:
     """The coverage that was published for a run's task, as lines of a plot: (name, coverage)."""
     return [
         (f"{line.method}, {line.last[0] / 1e6:.0f}M steps", line.last[1])
-        for line in (published(run.settings) if plot is PLOTS[0] else ())
+        for line in (published(run.settings) if plot is OF_GOALS[0] else ())
     ]
 
 
 class Curves:
-    """The plots of one run, or one plot with the coverage of several.
+    """The plots of one run, or of several: then a line for each run in every plot, which shows the
+    first of the plot's curves.
 
     Args:
         gui: where they go.
@@ -134,48 +156,48 @@ class Curves:
 
     def __init__(self, gui: viser.GuiApi, runs: list[Run]) -> None:
         self._runs = runs
+        kinds = dict.fromkeys(run.kind for run in runs)
+        self._plots = [plot for kind in kinds for plot in PLOTS[kind]]
         self._handles: list[Any] = []
-        if len(runs) > 1:
-            names = [run.name for run in runs]
-            self._handles.append(_add(gui, PLOTS[0], self._compared(), names, runs[0]))
-        else:
-            for plot in PLOTS:
-                names = [name for _, name in plot.curves]
-                self._handles.append(_add(gui, plot, self._data(plot), names, runs[0]))
+        for plot in self._plots:
+            names = [name for _, name in plot.curves]
+            shown = plot
+            if len(runs) > 1:
+                shown = replace(plot, title=f"{plot.title}: {names[0]}")
+                names = [run.task_and_method() for run in runs]
+            lines = levels(runs[0], plot)
+            self._handles.append(_add(gui, shown, self._data(plot), names, lines))
 
     def refresh(self) -> None:
         """Send what is new to the page."""
-        if len(self._runs) > 1:
-            self._handles[0].data = self._compared()
-        else:
-            for plot, handle in zip(PLOTS, self._handles, strict=True):
-                handle.data = self._data(plot)
+        for plot, handle in zip(self._plots, self._handles, strict=True):
+            handle.data = self._data(plot)
 
     def _data(self, plot: Plot) -> tuple[FloatArray, ...]:
-        data = series(self._runs[0], plot)
-        return (*data, *self._levels(plot, len(data[0])))
-
-    def _levels(self, plot: Plot, n: int) -> list[FloatArray]:
-        return [np.full(n, y) for _, y in levels(self._runs[0], plot)]
-
-    def _compared(self) -> tuple[FloatArray, ...]:
-        own = [series(run, PLOTS[0])[:2] for run in self._runs]
-        longest = max((steps for steps, _ in own), key=lambda steps: steps[-1])
-        curves = (np.interp(longest, x, y, right=np.nan) for x, y in own)
-        return (longest, *curves, *self._levels(PLOTS[0], len(longest)))
+        known = [series(run, plot) for run in self._runs]
+        x = max((steps for steps, *_ in known), key=lambda steps: steps[-1])
+        if len(known) == 1:
+            curves = known[0][1:]
+        else:
+            curves = tuple(np.interp(x, steps, first, right=np.nan) for steps, first, *_ in known)
+        return (x, *curves, *(np.full(len(x), y) for _, y in levels(self._runs[0], plot)))
 
 
 def _add(
-    gui: viser.GuiApi, plot: Plot, data: tuple[FloatArray, ...], names: list[str], run: Run
+    gui: viser.GuiApi,
+    plot: Plot,
+    data: tuple[FloatArray, ...],
+    names: list[str],
+    levels: list[tuple[str, float]],
 ) -> viser.GuiUplotHandle:
-    """A plot with the curves of those names and the levels published for a run's task."""
+    """A plot with the curves of those names, and published levels."""
     lines = [
-        uplot.Series(label=name, stroke=COLOURS[i % len(COLOURS)], width=2, spanGaps=True)
+        uplot.Series(label=name, stroke=RUNS[i % len(RUNS)], width=2, spanGaps=True)
         for i, name in enumerate(names)
     ]
     lines += [
         uplot.Series(label=name, stroke="#999999", width=1, dash=(4, 4 + 4 * i))
-        for i, (name, _) in enumerate(levels(run, plot))
+        for i, (name, _) in enumerate(levels)
     ]
     scales = {"x": uplot.Scale(time=False)}
     if plot.share:

@@ -19,10 +19,12 @@ from goalgan_bt.runs.files import write_atomically
 from goalgan_bt.runs.terminal import complain
 from goalgan_bt.viz.body import Bodies
 from goalgan_bt.viz.captions import caption, settings_rows, state
-from goalgan_bt.viz.curves import COLOURS, PLOTS, levels, series
+from goalgan_bt.viz.curves import PLOTS, levels, series
+from goalgan_bt.viz.layers import OF_KIND, legend
+from goalgan_bt.viz.palette import RUNS
 from goalgan_bt.viz.player import Player
 from goalgan_bt.viz.run import Frame, Run, places
-from goalgan_bt.viz.scene import LAYERS, Scene, legend, look_at
+from goalgan_bt.viz.scene import Scene, look_at
 from goalgan_bt.viz.server import start_server
 
 MOST_REPORTS = 300
@@ -46,7 +48,7 @@ def export(run: Run, path: Path) -> None:
         raise RunError(f"{run.folder} holds no report yet: wait for its first one")
     server = start_server("127.0.0.1", 0)
     try:
-        scene = Scene(server, run.maze, run.box())
+        scene = Scene(server, run)
         look_at(server.initial_camera, scene.centre, scene.size)
         picks = np.linspace(0, len(run.iterations) - 1, min(len(run.iterations), MOST_REPORTS))
         pause = float(np.clip(LENGTH / len(picks), 0.1, 1.0))
@@ -88,7 +90,7 @@ def _last_policy(
         return
     if not player.take_newest():
         return
-    bodies = Bodies(server, player.model, "/run/body/points")
+    bodies = Bodies(server, player.model)
     goals = player.env.test_goals()
     for row in np.linspace(0, len(goals) - 1, GOALS).round().astype(int):
         goal = goals[row : row + 1]
@@ -116,19 +118,19 @@ def _smaller(frame: Frame) -> Frame:
 def _beside(run: Run) -> dict[str, Any]:
     """What stands beside the scene."""
     plots = []
-    for plot in PLOTS:
+    for plot in PLOTS[run.kind]:
         steps, *values = series(run, plot)
         curves = [
             {"name": name, "colour": colour, "y": [_known(y) for y in column]}
-            for (_, name), colour, column in zip(plot.curves, COLOURS, values, strict=False)
+            for (_, name), colour, column in zip(plot.curves, RUNS, values, strict=False)
         ]
         lines = [{"name": name, "y": y} for name, y in levels(run, plot)]
         plots.append({"title": plot.title, "share": plot.share, "curves": curves, "levels": lines})
     return {
         "name": run.name,
         "state": state(run),
-        "legend": legend(),
-        "about": [(label, text) for label, text, _ in LAYERS.values()],
+        "legend": legend(run.kind),
+        "about": [(layer.label, layer.hint) for layer in OF_KIND[run.kind].values()],
         "settings": settings_rows(run.settings),
         "steps": [_known(x) or 0.0 for x in steps],
         "plots": plots,

@@ -22,7 +22,7 @@ from goalgan_bt.runs.terminal import complain
 from goalgan_bt.study.published import published
 from goalgan_bt.study.statistics import interval
 from goalgan_bt.viz import palette
-from goalgan_bt.viz.run import Run, drawn, labels, places, success
+from goalgan_bt.viz.run import Run, drawn, labels, on_floor, places
 
 WALL = "#c9cdd3"
 PRINT = {  # for a column of a paper
@@ -157,10 +157,8 @@ def _around(ax: Axes, runs: list[Measured]) -> None:
 
 
 def _title(run: Run) -> str:
-    """What tells a run from others, in three words; matplotlib reads formulas between dollars."""
-    known = [run.settings.get(name) for name in ("method", "seed")]
-    title = run.name if None in known else "{} {} s{}".format(run.task, *known)
-    return title.replace("$", r"\$")
+    """What tells a run from others; matplotlib reads formulas between dollars."""
+    return run.task_and_method().replace("$", r"\$")
 
 
 def coverage_map(ax: Axes, folder: Path, frame: Path, goals: float = 7.0) -> Any:
@@ -184,14 +182,14 @@ def coverage_map(ax: Axes, folder: Path, frame: Path, goals: float = 7.0) -> Any
     if maze is None:
         raise RunError(f"{folder} has no maze to draw: only its curve can be plotted")
     arrays = read_frame(frame)
-    rate, known = success(arrays)
+    rate, what = on_floor(arrays)
     tiles = arrays["test_goals"]
     ax.set_facecolor(WALL)
     side = maze.tile_side(len(tiles))
     image = ax.scatter([], [], c=[], cmap=palette.SUCCESS, vmin=0, vmax=1)
     for (x, y), colour in zip(tiles, palette.colours(rate) / 255, strict=True):
         ax.add_patch(Rectangle((x - side / 2, y - side / 2), side, side, color=colour, lw=0))
-    if goals:
+    if goals and what != "visits":
         lines = np.swapaxes(places(arrays, "traces", 3)[..., :2], 0, 1)
         ax.add_collection(LineCollection(list(lines), colors="#ff5a36", linewidths=0.5, alpha=0.7))
         for label, kind in palette.GOALS.items():
@@ -201,18 +199,18 @@ def coverage_map(ax: Axes, folder: Path, frame: Path, goals: float = 7.0) -> Any
     ax.plot(0, 0, marker="*", color="white", markeredgecolor="#111111", markersize=9)
     (x0, y0), (x1, y1) = drawn(maze, np.stack([maze.low, maze.high]))
     ax.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xticks=[], yticks=[])
-    what = "coverage" if known else "estimate"
-    told = f"iteration {int(frame.stem)}\n{what} {np.mean(rate):.2f}"
+    mean = np.mean(rate > 0 if what == "visits" else rate)
+    told = f"iteration {int(frame.stem)}\n{what} {mean:.2f}"
     ax.set_title(told, fontsize=_small(9))
     return image
 
 
 def measured_frames(folder: Path) -> list[Path]:
-    """The frames that hold a measured coverage, oldest first; one that is damaged is told."""
+    """The frames whose map was measured, oldest first; one that is damaged is told."""
     found = []
     for frame in frame_paths(folder):
         try:
-            if success(read_frame(frame))[1]:
+            if on_floor(read_frame(frame))[1] != "estimate":
                 found.append(frame)
         except RunError as error:
             complain(f"{error}: it is left out", "warning")
@@ -301,9 +299,12 @@ def _maps(part: SubFigure, runs: list[Run], columns: int, at: tuple[int, ...]) -
         for ax in row[len(picks) :]:
             ax.set_axis_off()
         row[0].set_ylabel(_title(run).replace(" ", "\n"), fontsize=_small(7))
-    part.colorbar(image, ax=axes, label="success", shrink=0.8)
+    rooms = {run.kind for run in runs} == {"rooms"}
+    label = "visits, logarithmic" if rooms else "success"
+    part.colorbar(image, ax=axes, label=label, shrink=0.8)
     handles, names = axes[0, 0].get_legend_handles_labels()
-    part.legend(handles, names, loc="outside lower center", ncols=3, fontsize=_small(7))
+    if handles:
+        part.legend(handles, names, loc="outside lower center", ncols=3, fontsize=_small(7))
 
 
 def _small(points: float) -> float:

@@ -1,4 +1,4 @@
-"""Episodes of a run's newest policy, in simulations of the view's own."""
+"""Episodes of a run's policies, in simulations of the view's own."""
 
 import os
 from dataclasses import dataclass
@@ -15,7 +15,9 @@ from goalgan_bt.envs.mujoco_env import MujocoEnv
 from goalgan_bt.learners.maze_learner import load_policy
 from goalgan_bt.learners.trained_policy import settings_of, world_of
 from goalgan_bt.recall.places import unit
+from goalgan_bt.runs import checkpoint
 from goalgan_bt.runs.errors import RunError
+from goalgan_bt.runs.policies import kept_policy
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class Attempt:
 
 
 class Player:
-    """Plays the policy of a run's checkpoint, which it takes up anew whenever it changes.
+    """Plays the policies of a run that learns to reach goals.
 
     Args:
         folder: the run folder.
@@ -64,7 +66,7 @@ class Player:
         goals = len(world_of(folder, 1)[1].test_goals())
         _, self.env = world_of(folder, goals)
         self._policy: GaussianPolicy | None = None
-        self._tried: int | None = None  # the checkpoint last looked at, by its time
+        self._tried: tuple[str, int] | None = None  # the file last looked at, and its time
         self.iteration = 0
         self.rng = np.random.default_rng(seed)
 
@@ -75,13 +77,19 @@ class Player:
 
     def take_newest(self) -> bool:
         """Load the checkpoint if it is new and whole; whether there is a policy to play."""
-        path = self._folder / "checkpoint.pt"
+        return self.take(None)
+
+    def take(self, iteration: int | None) -> bool:
+        """Load the policy of an iteration, or the last one before it that the run has kept; the
+        newest if None, or where none was kept. Whether there is a policy to play."""
+        kept = kept_policy(self._folder, iteration)
+        path = kept or self._folder / checkpoint.NAME
         try:
-            stamp = os.stat(path).st_mtime_ns
-            if stamp != self._tried:
-                self._tried = stamp
+            asked = path.name, os.stat(path).st_mtime_ns
+            if asked != self._tried:
+                self._tried = asked
                 cfg = settings_of(self._folder)  # a resumed run may have others
-                self._policy, self.iteration = load_policy(self.env, cfg, self._folder)
+                self._policy, self.iteration = load_policy(self.env, cfg, self._folder, kept)
         except (OSError, RunError):
             pass  # none yet, or another version: the last one will do
         return self._policy is not None
@@ -115,6 +123,10 @@ class Player:
         if self.env.heading is None:
             return places[:0], places[:0]
         return places, unit(self.env.heading(places, np.repeat(goal, len(places), axis=0)))
+
+    def trail(self, attempt: Attempt) -> FloatArray:
+        """Where the first body of an attempt was, (T + 1, goal_dim)."""
+        return np.asarray(self.env.achieved_goals(attempt.states[:, 0]))
 
     def some_goal(self) -> FloatArray:
         """A feasible goal at random, (1, goal_dim)."""

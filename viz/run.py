@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from goalgan_bt.envs.maze import FloatArray, Maze
+from goalgan_bt.learners.table import learner_of
 from goalgan_bt.runs import run_folder
-from goalgan_bt.runs.errors import RunError
+from goalgan_bt.runs.errors import RunError, UsageError
 from goalgan_bt.runs.frames import frame_paths, read_frame
 from goalgan_bt.runs.metrics_csv import Metrics
 
@@ -31,6 +32,7 @@ class Run:
     Attributes:
         name, env, maze: from the folder; maze is None where there are no walls.
         task: what is learned: env, or the body and its own map.
+        kind: what there is to see: goals in a place, rooms (a table of states), or running.
         settings: the resolved settings as nested dictionaries.
         iterations: of the frames there are, ascending.
         metrics: what `metrics.csv` holds.
@@ -49,6 +51,7 @@ class Run:
         self.env, own_map = str(self.settings["env"]), self.settings.get("map")
         body = self.env.rpartition(":")[2].split("_")[0].lower()
         self.task = self.env if own_map is None else f"{body}_{Path(str(own_map)).stem}"
+        self.kind = _kind_of(self.env)
         self.iterations: list[int] = []
         self.metrics = Metrics(folder / "metrics.csv")
         self.gone = False
@@ -93,9 +96,42 @@ class Run:
         goals = np.zeros((1, 2)) if frame is None else frame["goals"]
         return np.stack([np.minimum(goals.min(axis=0), -5), np.maximum(goals.max(axis=0), 5)])
 
+    def side(self) -> float:
+        """The longer side of what is drawn of it, metres."""
+        return float(np.ptp(drawn(self.maze, self.box()), axis=0).max())
+
+    def task_and_method(self) -> str:
+        """What tells it from other runs, where its settings say so; otherwise its name."""
+        known = [self.settings.get(name) for name in ("method", "seed")]
+        return self.name if None in known else "{} {} s{}".format(self.task, *known)
+
     def ended(self) -> str | None:
         """How the run ended, or None while it goes on (or was killed without a word)."""
         return run_folder.ended(self.folder)
+
+
+def _kind_of(env: str) -> str:
+    """What there is to see of an environment; of one that is not known here, goals."""
+    try:
+        return learner_of(env).page
+    except UsageError:
+        return "goals"
+
+
+def visits(frame: Frame) -> FloatArray:
+    """How often training has been at each test goal, (K,): 0 for never, 1 for the most, on a scale
+    of logarithms."""
+    times = of_goals(frame, "visits", np.zeros(len(frame["test_goals"])))
+    logs = np.log1p(np.maximum(np.nan_to_num(times), 0))
+    return np.asarray(logs / max(logs.max(initial=0.0), 1e-9))
+
+
+def on_floor(frame: Frame) -> tuple[FloatArray, str]:
+    """What the floor shows per test goal, (K,) from 0 to 1, and what that is, in a word."""
+    if "visits" in frame:
+        return visits(frame), "visits"
+    rate, known = success(frame)
+    return rate, "coverage" if known else "estimate"
 
 
 def success(frame: Frame) -> tuple[FloatArray, bool]:

@@ -1,91 +1,42 @@
-"""The 3D scene: the maze, the coverage map on its floor, goals, recall traces, paths.
+"""The 3D scene of a run: the maze, the map on its floor, goals, ways, traces, where a body went.
 
 Each layer is one node that is replaced in place; a frame of a run fills them all.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from goalgan_bt.envs.maze import FloatArray, Maze
-from goalgan_bt.viz.run import Frame, drawn, labels, of_goals, places, success
+from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
+from goalgan_bt.viz.layers import MARK, OF_KIND, OLD_TRACE, PATH, START, TRACE, TRAIL
+from goalgan_bt.viz.palette import GOALS, RGB, colours
+from goalgan_bt.viz.run import Frame, Run, drawn, labels, of_goals, places, success, visits
 
-# Red (never reached) over pale yellow to blue (mastered): ColorBrewer's RdYlBu, made to be told
-# apart by colour-blind people.
-STOPS = np.array(
-    [[165, 0, 38], [244, 109, 67], [254, 224, 144], [171, 217, 233], [69, 117, 180], [49, 54, 149]]
-)
-TOO_HARD, INTERMEDIATE, TOO_EASY, REPLAYED = (
-    (214, 39, 40),
-    (255, 255, 255),
-    (31, 119, 180),
-    (120, 120, 120),
-)
-TRACE, OLD_TRACE = (255, 150, 0), (25, 12, 12)  # at the goal, and farthest back
-PATH, MARK = (90, 90, 100), (255, 0, 170)
-WALL, FLOOR, START = (105, 110, 120), (45, 48, 54), (255, 255, 255)
+REPLAYED, WALL, FLOOR = (190, 190, 190), (105, 110, 120), (45, 48, 54)
 FAR_BELOW = np.full((1, 1, 3), -100, dtype=np.float32)  # where a layer with nothing in it is
+GROUND = 1.0  # metres from line to line of the ground on which bodies run
+FADES = 60  # steps in which a trail grows dim
 PIXELS = 16  # per tile of the coverage map
 ARROW = 0.32  # metres
 WALL_HEIGHT = 0.35  # metres: low, so that no wall hides the map
 
-# name: (label in the panel, what one is looking at, shown at first)
-LAYERS = {
-    "coverage": (
-        "Coverage map",
-        "The floor: how often the policy reaches each 0.5 m tile from the start. Measured where "
-        "the caption says so, otherwise the learner's own estimate from its recent episodes.",
-        True,
-    ),
-    "goals": (
-        "Goals",
-        "What the policy trains on now: imagined by the GAN, white of intermediate difficulty, "
-        "blue too easy, red too hard; remembered ones are smaller.",
-        True,
-    ),
-    "traces": (
-        "Recall traces",
-        "Imagined by the backtracking model: bright at the goal, fading backward in time.",
-        True,
-    ),
-    "ways": (
-        "Recalled ways",
-        "Which way leads from each place to the goal that the body goes for, as the backtracking "
-        "model over places recalls it. The policy sees that direction.",
-        True,
-    ),
-    "paths": ("Paths", "Where some of the last training episodes went.", False),
-    "replay": (
-        "Replay memory",
-        "Every goal that once was of intermediate difficulty; some are tried again.",
-        False,
-    ),
-    "walls": ("Walls", "The maze, drawn low so that it hides nothing.", True),
-    "body": ("Body", "The newest policy on its way to a goal, at real speed, over and over.", True),
-}
 
-
-def colours(rate: FloatArray) -> NDArray[np.uint8]:
-    """Success in [0, 1], (...), as RGB (..., 3); grey where it is not known."""
-    rate = np.asarray(rate, dtype=float)
-    stops = np.linspace(0, 1, len(STOPS))
-    rgb = np.stack([np.interp(rate, stops, channel) for channel in STOPS.T], axis=-1)
-    rgb[~np.isfinite(rate)] = 150
-    return rgb.round().astype(np.uint8)
-
-
-def tile_image(maze: Maze, tiles: FloatArray, rate: FloatArray) -> NDArray[np.uint8]:
+def tile_image(
+    maze: Maze, tiles: FloatArray, rate: FloatArray, all_tiles: int = 0
+) -> NDArray[np.uint8]:
     """The coverage map as an RGBA image over the maze's box, top row first.
 
     Args:
         maze: the layout.
         tiles: (K, 2) centres, metres.
         rate: (K,) success.
+        all_tiles: how many there would be on the whole floor, where these are only some.
     """
     rows, columns = maze.free.shape
-    side = maze.tile_side(len(tiles))
+    side = maze.tile_side(all_tiles or len(tiles))
     per_cell = round(maze.cell_size / side)
     image = np.zeros((rows * per_cell, PIXELS, columns * per_cell, PIXELS, 4), dtype=np.uint8)
     index = np.floor((tiles - maze.low) / side).astype(int)
@@ -137,29 +88,37 @@ class Scene:
 
     Args:
         server: whose scene it is.
-        maze: the layout, or None where there are no walls.
-        box: (2, goal_dim) low and high corner of the goals.
+        run: whose maze, or box without walls.
         prefix: name of the node under which all is drawn.
         offset: (x, y) of this run's maze in the scene, metres.
+        colour: of a strip under the run's name, where several stand side by side.
     """
 
     def __init__(
         self,
         server: viser.ViserServer,
-        maze: Maze | None,
-        box: FloatArray,
+        run: Run,
         prefix: str = "/run",
         offset: tuple[float, float] = (0.0, 0.0),
+        colour: str | None = None,
     ) -> None:
-        self._scene, self._maze, self._prefix = server.scene, maze, prefix
-        self._low, self._high = np.asarray(box)[:, :2]
-        self._first, self._last = drawn(maze, box)
+        self._scene, self._maze, self._prefix, self._kind = server.scene, run.maze, prefix, run.kind
+        box = run.box()
+        self._low, self._high = box[:, :2]
+        self._first, self._last = drawn(run.maze, box)
         self._scene.add_frame(prefix, show_axes=False, position=(*offset, 0.0))
         self._groups = {
-            name: self._scene.add_frame(f"{prefix}/{name}", show_axes=False, visible=shown)
-            for name, (_, _, shown) in LAYERS.items()
+            name: self._scene.add_frame(f"{prefix}/{name}", show_axes=False, visible=layer.shown)
+            for name, layer in OF_KIND[run.kind].items()
         }
-        self._draw_maze()
+        if run.kind == "running":
+            self.roll(0.0, 0.0)
+        elif run.maze is None:
+            self._draw_axes(box.shape[1])
+        else:
+            self._draw_maze()
+        if colour is not None:
+            self._draw_name(run.task_and_method(), colour)
 
     @property
     def size(self) -> float:
@@ -172,17 +131,21 @@ class Scene:
         return np.asarray((self._first + self._last) / 2)
 
     def show(self, layer: str, visible: bool) -> None:
-        """Show or hide a layer."""
-        self._groups[layer].visible = visible
+        """Show or hide a layer, if there is such a one."""
+        if layer in self._groups:
+            self._groups[layer].visible = visible
 
     def visible(self, layer: str) -> bool:
         """Whether a layer is shown."""
-        return bool(self._groups[layer].visible)
+        return layer in self._groups and bool(self._groups[layer].visible)
 
     def draw(self, frame: Frame) -> None:
         """Fill all layers from a frame; what a frame of an older version lacks stays empty."""
-        rate, _ = success(frame)
-        self._draw_coverage(frame["test_goals"], rate)
+        if self._kind == "rooms":
+            self._draw_tiles("coverage", frame["test_goals"], visits(frame), 0.005)
+            self._draw_policy(frame)
+            return
+        self._draw_tiles("coverage", frame["test_goals"], success(frame)[0], 0.005)
         self._draw_goals(frame)
         self._points("replay", places(frame, "replay", 2), REPLAYED, 0.012, 0.03)
         traces = places(frame, "traces", 3)
@@ -200,6 +163,36 @@ class Scene:
         few = goals[:1, None, :2] if len(goals) == 1 else np.empty((0, 1, 2))
         points, _ = segments(np.swapaxes(few + circle, 0, 1))
         self._lines("body", points, MARK, 3.0, "goal")
+
+    def roll(self, x: float, y: float) -> None:
+        """Draw the ground under a body that is kept in the middle and is at a place, metres."""
+        whole = f"{self._prefix}/ground"
+        known = self._scene.get_handle_by_name(whole)
+        place = -(x % GROUND), -(y % GROUND), 0.0
+        if known is not None:
+            known.position = place
+            return
+        self._scene.add_grid(
+            whole,
+            width=40.0,
+            height=40.0,
+            cell_size=GROUND,
+            cell_color=WALL,
+            section_color=WALL,
+            position=place,
+        )
+
+    def draw_trail(self, places: FloatArray) -> None:
+        """Draw where a body went, (T, goal_dim), the last places brightest; none clear it."""
+        points, step = segments(places[:, None])
+        fade = np.clip(1 - (len(places) - step) / FADES, 0.25, 1)[:, None]
+        shade = (np.array(TRAIL) * fade).astype(np.uint8)
+        self._lines("body", points, np.repeat(shade[:, None], 2, axis=1), 3.0, "trail")
+
+    def draw_tried(self, goals: FloatArray, reached: BoolArray, ended: BoolArray) -> None:
+        """Draw how an attempt at each of many goals, (n, goal_dim), ended, where it has; none
+        clear it."""
+        self._draw_tiles("tried", goals[ended], reached[ended].astype(float), 0.012, len(goals))
 
     def draw_ways(self, places: FloatArray, directions: FloatArray) -> None:
         """Draw a field of arrows: where, and in which directions of length 1, each (n, goal_dim);
@@ -235,41 +228,95 @@ class Scene:
             f"{self._prefix}/start", radius=0.1, color=START, position=(0.0, 0.0, 0.1)
         )
 
-    def _draw_coverage(self, tiles: FloatArray, rate: FloatArray) -> None:
+    def _draw_axes(self, dims: int) -> None:
+        """Where there are no walls: the box of the goals and what its two axes are."""
+        (x0, y0), (x1, y1) = self._first, self._last
+        corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
+        points, _ = segments(corners[:, None])
+        self._lines("walls", points - np.array([0, 0, 0.25], np.float32), (150, 150, 150), 2.0)
+        beyond = 0.03 * self.size
+        for axis, (x, y) in enumerate((((x0 + x1) / 2, y0 - beyond), (x0 - beyond, (y0 + y1) / 2))):
+            self._label(f"axis{axis}", f"dimension {axis + 1} of {dims}, m", x, y)
+            for value in (self._first[axis], 0.0, self._last[axis]):
+                there = (value, y0 - beyond / 2) if axis == 0 else (x0 - beyond / 2, value)
+                self._label(f"axis{axis}_{value:.0f}", f"{value:g}", *there)
+
+    def _draw_name(self, name: str, colour: str) -> None:
+        """A run's name above its maze, in the colour of its curve."""
+        red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
+        top = self._last[1] + 0.07 * self.size
+        self._scene.add_box(
+            f"{self._prefix}/name/strip",
+            color=(red, green, blue),
+            dimensions=(self._last[0] - self._first[0], 0.035 * self.size, 0.02),
+            position=(self.centre[0], top, 0.0),
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        self._label("name/text", name, self.centre[0], top + 0.07 * self.size)
+
+    def _label(self, node: str, text: str, x: float, y: float) -> None:
+        self._scene.add_label(
+            f"{self._prefix}/{node}",
+            text,
+            position=(x, y, 0.0),
+            anchor="center-center",
+            font_size_mode="scene",
+            font_scene_height=0.045 * self.size,
+        )
+
+    def _draw_tiles(
+        self, layer: str, tiles: FloatArray, rate: FloatArray, height: float, all_tiles: int = 0
+    ) -> None:
+        """A map as an image of tiles, or as dots where there is no maze; of `all_tiles` tiles these
+        are some."""
         if self._maze is None:
-            self._points("coverage", tiles, colours(rate), 0.14, 0.01)
+            self._points(layer, tiles, colours(rate), 0.14, 0.01)
             return
-        width, height = self._high - self._low
+        width, height_of_map = self._high - self._low
         self._scene.add_image(
-            self._name("coverage"),
-            tile_image(self._maze, tiles, rate),
+            self._name(layer),
+            tile_image(self._maze, tiles, rate, all_tiles),
             render_width=float(width),
-            render_height=float(height),
+            render_height=float(height_of_map),
             format="png",
             cast_shadow=False,
             receive_shadow=False,
-            position=(*(self._low + self._high) / 2, 0.005),
+            position=(*(self._low + self._high) / 2, height),
             wxyz=(0.0, 1.0, 0.0, 0.0),  # viser's images look down; seen from above, y is up
         )
 
+    def _draw_policy(self, frame: Frame) -> None:
+        """Where the policy goes from each cell, and the goal."""
+        cells, policy = frame["test_goals"], places(frame, "policy", 2)
+        fits = policy.shape == cells.shape
+        lines = arrows(cells, policy * 2) if fits else np.empty((0, 2, 3), dtype=np.float32)
+        self._lines("policy", lines, MARK, 1.5)
+        angle = np.linspace(0, 2 * np.pi, 33)
+        ring = 0.4 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        points, _ = segments(np.swapaxes(frame["goals"][:1, None, :2] + ring, 0, 1))
+        self._lines("policy", points, MARK, 3.0, "goal")
+
     def _draw_goals(self, frame: Frame) -> None:
-        goals = frame["goals"]
-        shade = np.array([TOO_HARD, INTERMEDIATE, TOO_EASY], dtype=np.uint8)[labels(frame) + 1]
+        goals, kinds = frame["goals"], labels(frame)
         old = of_goals(frame, "replayed", np.zeros(len(goals))) > 0
-        for node, rows, size in (("new", ~old, 0.09), ("old", old, 0.05)):
-            # A dark rim, so that white goals are seen on a pale floor.
-            # They float: a disc that faces the camera would stick in the floor.
-            self._points("goals", goals[rows], (20, 20, 20), size * 1.3, 0.1, node + "_rim")
-            self._points("goals", goals[rows], shade[rows], size, 0.11, node)
+        for label, kind in GOALS.items():
+            for node, rows, size in (("new", ~old, 0.09), ("old", old, 0.05)):
+                these, name = goals[rows & (kinds == label)], f"{kind.shape}_{node}"
+                # They float: a disc that faces the camera would stick in the floor. The rim lets
+                # them be seen on any colour.
+                self._points("goals", these, kind.rim, size * 1.4, 0.1, name + "_rim", kind.shape)
+                self._points("goals", these, kind.fill, size, 0.11, name, kind.shape)
 
     def _points(
         self,
         layer: str,
         points: FloatArray,
-        colour: NDArray[np.uint8] | tuple[int, int, int],
+        colour: NDArray[np.uint8] | RGB,
         size: float,
         height: float,
         node: str = "node",
+        shape: Any = "circle",
     ) -> None:
         places = on_floor(points, height)
         if not len(places):  # the page wants as many colours as points, and one of each
@@ -279,7 +326,7 @@ class Scene:
             places,
             colour,
             point_size=size,
-            point_shape="circle",
+            point_shape=shape,
             point_shading="flat",
             precision="float32",
         )
@@ -288,7 +335,7 @@ class Scene:
         self,
         layer: str,
         points: NDArray[np.float32],
-        colour: NDArray[np.uint8] | tuple[int, int, int],
+        colour: NDArray[np.uint8] | RGB,
         width: float,
         node: str = "node",
     ) -> None:
@@ -309,27 +356,3 @@ def look_at(
     """Put a camera where a square of the floor is seen: its middle, (2,), and side, metres."""
     camera.position = (centre[0], centre[1] - 0.5 * size, 0.92 * size)
     camera.look_at = (centre[0], centre[1], 0.0)
-
-
-def legend() -> str:
-    """The colours of the map as HTML."""
-    stops = ", ".join(
-        f"rgb({r},{g},{b}) {100 * i / (len(STOPS) - 1):.0f}%" for i, (r, g, b) in enumerate(STOPS)
-    )
-    dot = "display:inline-block;width:10px;height:10px;border-radius:5px;border:1px solid #333"
-    dots = " ".join(
-        f'<span style="white-space:nowrap"><span style="{dot};background:rgb{colour}"></span> '
-        f"{text}</span>&nbsp;"
-        for text, colour in (
-            ("too hard", TOO_HARD),
-            ("intermediate", INTERMEDIATE),
-            ("too easy", TOO_EASY),
-        )
-    )
-    return (
-        '<div style="font-size:12px;padding:4px 12px"><div style="display:flex;gap:8px;'
-        'align-items:center"><span>never</span>'
-        f'<div style="flex:1;height:10px;border-radius:5px;background:linear-gradient(90deg,'
-        f'{stops})"></div><span>always reached</span></div><div style="margin-top:4px">{dots}'
-        "</div></div>"
-    )

@@ -14,14 +14,15 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
 from goalgan_bt.agent.advantage import gae
-from goalgan_bt.envs.four_rooms import SIZES, FourRooms, Ints
-from goalgan_bt.envs.maze import BoolArray, FloatArray
+from goalgan_bt.envs.four_rooms import ACTIONS, SIZES, FourRooms, Ints
+from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
 from goalgan_bt.learners.run_config import RunConfig, Trained, World
 from goalgan_bt.runs.errors import UsageError
 from goalgan_bt.runs.files import write_atomically
@@ -341,7 +342,7 @@ def measure(
 
 
 def train(cfg: FourRoomsConfig, folder: Path | None, stop: Stop | None = None) -> Trained:
-    """Learn to find the goal; writes `metrics.csv` and `visits.npz` into the run folder.
+    """Learn to find the goal; writes `metrics.csv`, frames and `visits.npz` into the run folder.
 
     Args:
         cfg: settings.
@@ -385,12 +386,27 @@ def train(cfg: FourRoomsConfig, folder: Path | None, stop: Stop | None = None) -
                 run.count("eval", steps)
                 run.note("eval", {"coverage": success, "return": round(discounted, 6)})
                 run.note("eval", {"states": int((visits > 0).sum())})
-                run.report({"train/states": int((visited > 0).sum())})
+                known = {"train/states": int((visited > 0).sum())}
+                run.report(known, partial(frame, rooms, learner, visited))
         if folder is not None:
             grids = {"training": visited, "trained": visits}
             pictures: dict[str, Any] = {name: rooms.picture(n) for name, n in grids.items()}
             write_atomically(folder / "visits.npz", lambda file: np.savez(file, **pictures))
     return Trained(folder, "coverage", success, run.steps["train"])
+
+
+def frame(rooms: FourRooms, learner: ActorCritic, visited: Ints) -> dict[str, Any]:
+    """What the page shows of a report (see `RunWriter.frame`), with visits (S,) of training so far,
+    and policy (S, 2): where it goes from each cell on average, cells per step."""
+    moves = np.array(ACTIONS)[:, ::-1] * [1, -1]  # (row, column) as (x, y): y is up
+    places = (rooms.cells - rooms.cells[rooms.start])[:, ::-1] * [1.0, -1.0]
+    return {
+        "goals": places[[rooms.goal]],
+        "test_goals": places,
+        "coverage": np.full(len(places), np.nan),
+        "visits": visited,
+        "policy": learner.probabilities() @ moves,
+    }
 
 
 def improve(learner: ActorCritic, batch: Batch, cfg: FourRoomsConfig) -> None:
@@ -419,7 +435,7 @@ def prepared(cfg: FourRoomsConfig) -> Iterator[World]:
         UsageError: for several processes.
     """
     refuse_company(cfg.env)
-    yield World(cfg.env, None)
+    yield World(cfg.env, Maze(FourRooms(cfg.size).rows, 1.0))
 
 
 TABLE = {  # the paper's settings of prioritised replay by size: batch, every, alpha, beta

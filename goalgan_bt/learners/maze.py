@@ -33,6 +33,7 @@ from goalgan_bt.recall.transitions import Steps
 from goalgan_bt.runs import ranks
 from goalgan_bt.runs.background import group
 from goalgan_bt.runs.errors import InterruptedRun, UsageError
+from goalgan_bt.runs.policies import keep_policy
 from goalgan_bt.runs.session import Limits, Schedule, Session
 from goalgan_bt.runs.signals import Stop
 from goalgan_bt.runs.sound import finite, soundly
@@ -561,7 +562,9 @@ def save(learner: MazeLearner, collector: Collector, run: Session) -> None:
         return
     with run.clock.measure("saving"):
         run.background.finish()
-        run.save({"learner": learner.state_dict(), "collector": collector.state_dict()})
+        run.save(
+            {"learner": learner.state_dict(), "collector": collector.state_dict()}, keep_policy
+        )
 
 
 def mean(values: np.ndarray) -> float:

@@ -202,13 +202,16 @@ def load(learner: MazeLearner, folder: Path, collector: Collector | None = None)
     return run
 
 
-def load_policy(env: GoalEnv, cfg: MazeConfig, folder: Path) -> tuple[GaussianPolicy, int]:
+def load_policy(
+    env: GoalEnv, cfg: MazeConfig, folder: Path, kept: Path | None = None
+) -> tuple[GaussianPolicy, int]:
     """The policy of a run's `checkpoint.pt`, and to the environment the heading that it goes by.
 
     Args:
         env: where it will act.
         cfg: the run's settings.
         folder: the run folder.
+        kept: one that the run has kept in the checkpoint's place (`goalgan_bt.runs.policies`).
 
     Returns:
         The policy, and the iteration that made it.
@@ -220,7 +223,7 @@ def load_policy(env: GoalEnv, cfg: MazeConfig, folder: Path) -> tuple[GaussianPo
     env.heading = places.heading if cfg.places.heading else None  # the policy's size is with it
     try:
         policy = GaussianPolicy(env.obs_dim, env.act_dim, cfg.policy)
-        with checkpoint.saved(folder) as state:
+        with checkpoint.saved(folder, kept) as state:
             places.load_state_dict(state["learner"]["places"])
             policy.load_state_dict(state["learner"]["policy"])
             iteration = int(state["run"]["iteration"])

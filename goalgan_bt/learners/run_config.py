@@ -28,8 +28,7 @@ class RunConfig:
     """Give the metrics to Weights & Biases, too (extra `wandb`): offline, in the run folder, unless
     WANDB_MODE says otherwise. To be said again with --resume."""
     viz: Literal["browser", "none"] = "browser"
-    """Where to watch: a page in the browser, in a process of its own, or nowhere. Only mazes and
-    point_nd have a map to show."""
+    """Where to watch: a page in the browser, in a process of its own, or nowhere."""
     viz_host: str = "127.0.0.1"
     """Where the page listens; 0.0.0.0 lets everybody on the network in, without a password."""
     viz_port: Annotated[int, Range("between 0 and 65535", 0, 65535)] = 8080

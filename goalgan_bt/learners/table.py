@@ -32,8 +32,8 @@ class Learner(NamedTuple):
     `train(cfg, folder, stop)`; imported when it is needed, since torch takes seconds.
     config: the class of its settings; names: its environments; knows: whether one is among them;
     preset: the settings of an environment and a method; check: refuses what does not go together;
-    may_change: settings that a resumed run may change; has_map: whether there is a page to look at;
-    measure: what it is judged by.
+    may_change: settings that a resumed run may change; page: what there is to see of it, see
+    `goalgan_bt.viz.layers`; measure: what it is judged by.
     """
 
     module: str
@@ -43,7 +43,7 @@ class Learner(NamedTuple):
     preset: Callable[[str, str | None], RunConfig]
     check: Callable[[Any], None]
     may_change: frozenset[str]
-    has_map: bool
+    page: str
     measure: str
 
 
@@ -58,7 +58,7 @@ LEARNERS = (
         maze_config.preset,
         maze_config.check,
         LOOKING | maze_config.MAY_CHANGE,
-        True,
+        "goals",
         "coverage",
     ),
     Learner(
@@ -69,7 +69,7 @@ LEARNERS = (
         four_rooms.preset,
         four_rooms.check,
         LOOKING | {"total_steps"},
-        False,
+        "rooms",
         "coverage",
     ),
     Learner(
@@ -80,7 +80,7 @@ LEARNERS = (
         locomotion.preset,
         locomotion.check,
         LOOKING,
-        False,
+        "running",
         "return",
     ),
 )

@@ -205,14 +205,14 @@ OTHER = "it is damaged or of other settings or another version"
 
 
 @contextmanager
-def saved(folder: Path) -> Iterator[dict[str, Any]]:
+def saved(folder: Path, kept: Path | None = None) -> Iterator[dict[str, Any]]:
     """A run's checkpoint, while it is taken over; the one before where the last is damaged, which
-    is then told.
+    is then told. Or another file of the run in its place.
 
     Raises:
         RunError: for whatever goes wrong while it is read and taken over.
     """
-    path, previous = folder / NAME, folder / PREVIOUS
+    path, previous = kept or folder / NAME, folder / PREVIOUS
     try:
         state = read(path)
     except (OSError, ValueError) as error:

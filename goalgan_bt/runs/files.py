@@ -59,7 +59,7 @@ def check_own(folder: Path) -> None:
     Raises:
         RunError: naming the first entry that is something else.
     """
-    for place in (folder, folder / "frames"):
+    for place in (folder, folder / "frames", folder / "policies"):
         for entry in os.scandir(place) if place.is_dir() else ():
             plain = entry.is_file(follow_symlinks=False) or entry.is_dir(follow_symlinks=False)
             if not plain:

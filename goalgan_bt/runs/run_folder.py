@@ -5,6 +5,7 @@ runs/<env>-<time>-s<seed>/    (<env>-<method>-<time>-s<seed> where the method is
     meta.json         versions, git commit, command line, the maze as text; what it was resumed with
     metrics.csv       a row per iteration; columns may be added while it grows
     frames/000010.npz a report: goals, labels, replay, traces, coverage (see `RunWriter.frame`)
+    policies/000010.pt  policies of some measurements (see `goalgan_bt.runs.policies`)
     checkpoint.pt     the whole training state (see `goalgan_bt.runs.checkpoint`)
     policy.pt         of locomotion, in the checkpoint's place when it is finished
     ended.txt         how the run ended; absent while it goes on, or where it was killed

@@ -12,6 +12,7 @@ from goalgan_bt.runs.errors import RunError
 from goalgan_bt.runs.files import check_own, open_to_write, write_atomically
 from goalgan_bt.runs.frames import frame_paths
 from goalgan_bt.runs.metrics_csv import sound_rows, write_table
+from goalgan_bt.runs.policies import forget_after
 from goalgan_bt.runs.run_folder import ENDED, end_run, note_resumed
 from goalgan_bt.runs.terminal import complain
 
@@ -64,6 +65,7 @@ class RunWriter:
         for frame in frame_paths(folder):
             if int(frame.stem) > iteration:
                 frame.unlink()
+        forget_after(folder, iteration)
         known = int(kept[-1]["steps/train"]) if kept else 0
         self._events = _tensorboard(folder, known) if events else None
 

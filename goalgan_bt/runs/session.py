@@ -236,14 +236,26 @@ class Session:
             if frame is not None:
                 self._writer.frame(self.iteration, **frame())
 
-    def save(self, state: Mapping[str, Any]) -> None:
-        """Write a checkpoint. After the report, so that all that it goes on from is there."""
+    def save(
+        self,
+        state: Mapping[str, Any],
+        keep: Callable[[dict[str, Any], Path], None] | None = None,
+    ) -> None:
+        """Write a checkpoint. After the report, so that all that it goes on from is there.
+
+        Args:
+            state: all that learns and remembers.
+            keep: told what was saved, and the folder: what shall outlast the next checkpoint.
+        """
         if self._writer is None or self.folder is None:
             return
         from goalgan_bt.runs import checkpoint  # torch, which not every learner needs
 
         self._writer.sync()
-        checkpoint.save_run({"run": self.state_dict(), **state}, self.folder)
+        whole = {"run": self.state_dict(), **state}
+        checkpoint.save_run(whole, self.folder)
+        if keep is not None:
+            keep(whole, self.folder)
 
     def left(self) -> float:
         """Seconds that the run will still take; infinite where nothing tells."""
