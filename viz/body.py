@@ -72,11 +72,10 @@ class Bodies:
             self._data.qpos[:] = state[: self._model.nq]
             mujoco.mj_kinematics(self._model, self._data)
             xpos[i], xmat[i] = self._data.xpos, self._data.xmat.reshape(-1, 3, 3)
-        self._scene.update_from_arrays(xpos, xmat)
         if self._offset is None:
-            x, y = xpos[0, 1, :2]  # the root
-            self._middle = float(x), float(y)
-            self._move((-x, -y))
+            self._middle = float(xpos[0, 1, 0]), float(xpos[0, 1, 1])  # the root
+            xpos[..., :2] -= self._middle
+        self._scene.update_from_arrays(xpos, xmat)
 
     def _move(self, offset: tuple[float, float]) -> None:
         node = self._server.scene.get_handle_by_name(MOVING)

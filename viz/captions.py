@@ -9,6 +9,7 @@ from goalgan_bt.runs.metrics_csv import Metrics
 from goalgan_bt.runs.run_folder import flat
 from goalgan_bt.viz.run import Frame, Run, labels, success, visits
 
+CLICK = "**Click on the floor**: the body goes there."
 SILENT = 120.0  # seconds without news after which a run counts as stopped
 
 
@@ -52,20 +53,28 @@ def doing(run: Run) -> str:
         value = _last_known(metrics, "eval/coverage")
         told = "" if value != value else f" It finds it in {value:.0%} of its tries."
         return f"An agent looks for the goal, which is in the far one of four rooms.{told}"
-    covered, _ = measured(metrics)
-    if covered != covered:
-        covered = _last_known(metrics, "curriculum/estimated_coverage")
     world = "box" if run.maze is None else "maze"
-    known = "" if covered != covered else f"It reaches **{covered:.0%}** of the {world}"
     if over:
-        return f"A body has learned to go through this {world}. {known}: click anywhere to see."
+        covered, _ = measured(metrics)
+        known = "" if covered != covered else f" It reaches **{covered:.0%}** of the {world}."
+        return f"A body has learned to go through this {world}.{known} {CLICK}"
     frame = run.frame(run.iterations[-1]) if run.iterations else None
     if frame is None or not len(frame["goals"]):
         return f"A body learns to reach every place of this {world}. It has just begun."
-    what = practised(run, frame)
-    return f"A body learns to reach every place of this {world}. {what}" + (
-        f" {known}." if known else ""
-    )
+    what = f"A body learns to reach every place of this {world}."
+    return " ".join([what, practised(run, frame), covers(metrics, world), CLICK])
+
+
+def covers(metrics: Metrics, world: str) -> str:
+    """How much of its world a body reaches: one figure, the other in brackets with its date."""
+    covered, steps = measured(metrics)
+    estimate = _last_known(metrics, "curriculum/estimated_coverage")
+    if steps == metrics.last("steps/train") or (estimate != estimate and covered == covered):
+        return f"It reaches **{covered:.0%}** of the {world}."
+    if estimate != estimate:
+        return ""
+    before = "" if covered != covered else f"; measured at {steps / 1e6:.2f}M steps: {covered:.0%}"
+    return f"It reaches about **{estimate:.0%}** of the {world} (its own estimate{before})."
 
 
 def practised(run: Run, frame: Frame) -> str:
@@ -84,9 +93,12 @@ def practised(run: Run, frame: Frame) -> str:
         return "It tries goals that no body can reach, for now."
     near, most = np.percentile(far, [10, 90])
     where = f"{near:.0f} m" if round(near) == round(most) else f"{near:.0f} to {most:.0f} m"
+    walls = 0.0 if run.maze is None else 1 - float(run.maze.is_free(goals[:, :2]).mean())
+    told = f"Now it practises {where} from the start ({whole})"
     success = _last_known(run.metrics, "rollout/success")
-    told = "" if success != success else f" and reaches {success:.0%} of its goals"
-    return f"Now it practises {where} from the start ({whole}){told}."
+    if success == success:
+        told += f"; {success:.0%} of its attempts succeed"
+    return told + (f", {walls:.0%} of the goals lie in walls." if walls >= 0.005 else ".")
 
 
 def _last_known(metrics: Metrics, name: str) -> float:

@@ -6,7 +6,7 @@ from goalgan_bt.viz import palette
 from goalgan_bt.viz.palette import RGB, css
 
 TRACE, OLD_TRACE = (255, 150, 0), (60, 25, 12)  # at the goal, and farthest back
-PATH, MARK, TRAIL, START = (120, 120, 130), (255, 0, 170), (235, 30, 30), (255, 255, 255)
+PATH, MARK, TRAIL, START = (120, 120, 130), (255, 0, 170), (235, 30, 30), (70, 190, 255)
 
 
 class Layer(NamedTuple):
@@ -28,7 +28,8 @@ GOALS = {  # a run whose policy learns to reach goals
     "goals": Layer(
         "Goals",
         "What the policy trains on now, imagined by the GAN: circles of intermediate difficulty, "
-        "squares too easy, diamonds too hard; remembered ones are smaller.",
+        "squares too easy, diamonds too hard; remembered ones are smaller. Those that lie in walls "
+        "are left out.",
         True,
     ),
     "traces": Layer(
@@ -39,7 +40,8 @@ GOALS = {  # a run whose policy learns to reach goals
     "ways": Layer(
         "Recalled ways",
         "Which way leads from each place to the goal that the body goes for, as the backtracking "
-        "model over places recalls it. The policy sees that direction.",
+        "model over places recalls it; straight to it where it knows no way. The policy sees that "
+        "direction.",
         True,
     ),
     "paths": Layer("Paths", "Where some of the last training episodes went.", False),
@@ -91,15 +93,23 @@ def legend(kind: str) -> str:
         f'linear-gradient(90deg,{stops})"></div><span>{high}</span></div>'
     )
     if kind == "rooms":
-        items = [("start", _dot(START)), ("goal", _ring()), ("the policy's way", _arrow())]
+        rows = [[("start", _dot(START)), ("goal", _ring()), ("the policy's way", _arrow())]]
     else:
-        items = [(goal.text, _shape(goal)) for goal in palette.GOALS.values()]
-        items += [("start", _dot(START)), ("goal of the body", _ring()), ("its trail", _line())]
-        items += [("recalled way", _arrow()), ("recall trace", _line(TRACE))]
-    words = " ".join(
-        f'<span style="white-space:nowrap">{sign} {text}</span>&nbsp;' for text, sign in items
+        goals = [(goal.text, _shape(goal)) for goal in palette.GOALS.values()]
+        rows = [
+            [("Goals that it practises (remembered ones smaller):", ""), *goals],
+            [("start", _dot(START)), ("goal of the body", _ring()), ("its trail", _line())],
+            [("way to the ring, as recalled", _arrow()), ("recall trace", _line(TRACE))],
+        ]
+    words = "".join(
+        "<div>"
+        + " ".join(
+            f'<span style="white-space:nowrap">{sign} {text}</span>&nbsp;' for text, sign in row
+        )
+        + "</div>"
+        for row in rows
     )
-    return f'<div style="font-size:12px;padding:4px 12px">{bar}<div>{words}</div></div>'
+    return f'<div style="font-size:12px;padding:4px 12px">{bar}{words}</div>'
 
 
 def about(kind: str) -> str:
@@ -124,7 +134,7 @@ def _shape(goal: palette.Goal) -> str:
 
 
 def _dot(colour: RGB) -> str:
-    return _svg(f'<circle cx="6" cy="6" r="5" fill="{css(colour)}"/>')
+    return _svg(f'<circle cx="6" cy="6" r="5" fill="{css(colour)}" stroke="#888888"/>')
 
 
 def _ring() -> str:

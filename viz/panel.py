@@ -53,6 +53,8 @@ class Panel:
             self._run: Any = gui.add_dropdown("Run", names, hint="Whose body is on show")
             self._run.on_update(lambda event: ask("choose", event.target.value))
         self.status = gui.add_markdown("")
+        # What the body is doing.
+        self.outcome = gui.add_markdown("No policy yet.", visible=self._kinds != ["rooms"])
         tabs = gui.add_tab_group()
         self._reports = self._kinds != ["running"]
         with tabs.add_tab("Time" if self._reports else "Body"):
@@ -78,16 +80,12 @@ class Panel:
     def _add_time(self) -> None:
         gui, there = self._gui, self._reports
         self.caption = gui.add_markdown("No report yet: the first one comes soon.", visible=there)
-        # What the body does: under "Try", where goals can be set.
-        self.outcome = gui.add_markdown(
-            "No policy yet: the first one comes soon.", visible=not there
-        )
         # viser declares `value` read-only, which it is not.
         self.slider: Any = gui.add_slider("Report", 0, 1, 1, 0, visible=there)
         self.follow: Any = gui.add_checkbox("Follow live", True, visible=there)
         self.play: Any = gui.add_checkbox("Play", False, visible=there)
         self.speed = gui.add_slider("Reports per second", 1, 20, 1, 5, visible=there)
-        with gui.add_folder("Layers"):
+        with gui.add_folder("Layers", expand_by_default=not there):
             self._boxes: dict[str, Any] = {}
             for name, layer in self._layers.items():
                 box = gui.add_checkbox(layer.label, layer.shown, hint=layer.hint)
@@ -105,7 +103,6 @@ class Panel:
         gui.add_button("Try all tiles").on_click(lambda _: self._ask("all", None))
         again = gui.add_button("Let it choose goals again")
         again.on_click(lambda _: self._ask("release", None))
-        self.outcome = gui.add_markdown("No goal set yet.")
 
     def _add_about(self) -> None:
         gui = self._gui

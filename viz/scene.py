@@ -21,7 +21,7 @@ GROUND = 1.0  # metres from line to line of the ground on which bodies run
 FADES = 60  # steps in which a trail grows dim
 PIXELS = 16  # per tile of the coverage map
 ARROW = 0.32  # metres
-WALL_HEIGHT = 0.35  # metres: low, so that no wall hides the map
+WALL_HEIGHT = 0.25  # metres: low, so that no wall hides the map
 
 
 def tile_image(
@@ -163,6 +163,7 @@ class Scene:
         few = goals[:1, None, :2] if len(goals) == 1 else np.empty((0, 1, 2))
         points, _ = segments(np.swapaxes(few + circle, 0, 1))
         self._lines("body", points, MARK, 3.0, "goal")
+        self._points("body", goals[: len(few)], MARK, 0.1, 0.1, "pin")
 
     def roll(self, x: float, y: float) -> None:
         """Draw the ground under a body that is kept in the middle and is at a place, metres."""
@@ -185,7 +186,7 @@ class Scene:
     def draw_trail(self, places: FloatArray) -> None:
         """Draw where a body went, (T, goal_dim), the last places brightest; none clear it."""
         points, step = segments(places[:, None])
-        fade = np.clip(1 - (len(places) - step) / FADES, 0.25, 1)[:, None]
+        fade = np.clip(1 - (len(places) - step) / FADES, 0.5, 1)[:, None]
         shade = (np.array(TRAIL) * fade).astype(np.uint8)
         self._lines("body", points, np.repeat(shade[:, None], 2, axis=1), 3.0, "trail")
 
@@ -253,7 +254,7 @@ class Scene:
             cast_shadow=False,
             receive_shadow=False,
         )
-        self._label("name/text", name, self.centre[0], top + 0.07 * self.size)
+        self._label("name/text", name, self.centre[0], top + 0.08 * self.size)
 
     def _label(self, node: str, text: str, x: float, y: float) -> None:
         self._scene.add_label(
@@ -262,7 +263,7 @@ class Scene:
             position=(x, y, 0.0),
             anchor="center-center",
             font_size_mode="scene",
-            font_scene_height=0.045 * self.size,
+            font_scene_height=0.06 * self.size,
         )
 
     def _draw_tiles(
@@ -299,13 +300,15 @@ class Scene:
 
     def _draw_goals(self, frame: Frame) -> None:
         goals, kinds = frame["goals"], labels(frame)
+        # Those in walls are told in words: here they would lie on walls, or float beside the maze.
+        seen = np.ones(len(goals), bool) if self._maze is None else self._maze.is_free(goals[:, :2])
         old = of_goals(frame, "replayed", np.zeros(len(goals))) > 0
         for label, kind in GOALS.items():
-            for node, rows, size in (("new", ~old, 0.09), ("old", old, 0.05)):
-                these, name = goals[rows & (kinds == label)], f"{kind.shape}_{node}"
+            for node, rows, size in (("new", ~old, 0.07), ("old", old, 0.045)):
+                these, name = goals[rows & seen & (kinds == label)], f"{kind.shape}_{node}"
                 # They float: a disc that faces the camera would stick in the floor. The rim lets
                 # them be seen on any colour.
-                self._points("goals", these, kind.rim, size * 1.4, 0.1, name + "_rim", kind.shape)
+                self._points("goals", these, kind.rim, size * 1.3, 0.1, name + "_rim", kind.shape)
                 self._points("goals", these, kind.fill, size, 0.11, name, kind.shape)
 
     def _points(
@@ -354,5 +357,5 @@ def look_at(
     camera: viser.InitialCameraConfig | viser.CameraHandle, centre: FloatArray, size: float
 ) -> None:
     """Put a camera where a square of the floor is seen: its middle, (2,), and side, metres."""
-    camera.position = (centre[0], centre[1] - 0.5 * size, 0.92 * size)
+    camera.position = (centre[0], centre[1] - 0.4 * size, 0.97 * size)
     camera.look_at = (centre[0], centre[1], 0.0)

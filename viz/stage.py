@@ -40,7 +40,7 @@ class Stage:
         self._attempt: Attempt | None = None
         self._began, self._next_try, self._ended = 0.0, 0.0, -1
         self._trail: FloatArray = np.empty((0, 2))
-        self.asked, self.words = False, "No goal set yet."
+        self.asked, self.words = False, "No policy yet: the first one comes soon."
         self.report: int | None = None  # whose policy it shall be; None: the newest
 
     def play(self, now: float) -> None:

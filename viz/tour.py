@@ -14,7 +14,7 @@ class Stop(NamedTuple):
 TOUR = (
     Stop(
         "The floor",
-        "A body shall learn to walk from the white ball to **any** place of this maze. Each square "
+        "A body shall learn to walk from the blue ball to **any** place of this maze. Each square "
         "of the floor is such a place: dark where the body never gets, bright where it always "
         "does. While it learns, the bright part grows.",
         ("coverage", "walls"),
@@ -35,8 +35,8 @@ TOUR = (
     Stop(
         "The way back",
         "A second model remembers which place was reached from which, and recalls backward from "
-        "the goal how one may come to it: the pink **arrows**. The body sees the arrow where it "
-        "stands, but not the map.",
+        "the goal how one may come to it: the pink **arrows** (straight to the goal where it knows "
+        "no way). The body sees the arrow where it stands, but not the map.",
         ("walls", "body", "ways"),
     ),
     Stop(

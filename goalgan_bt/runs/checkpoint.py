@@ -217,7 +217,7 @@ def saved(folder: Path, kept: Path | None = None) -> Iterator[dict[str, Any]]:
         state = read(path)
     except (OSError, ValueError) as error:
         missing = not os.path.lexists(path)
-        if not previous.is_file():
+        if not previous.is_file() or kept is not None:
             if missing:
                 raise RunError(
                     f"{folder} has no checkpoint.pt to resume from: start a new run"
