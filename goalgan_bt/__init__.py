@@ -6,6 +6,7 @@ A whole run, as the command `python -m goalgan_bt.train` does it (`--help` lists
     trained = goalgan_bt.train("point_umaze", seed=0, total_steps=1_000_000, out="runs")
     policy = goalgan_bt.load_policy(trained.folder)
     action = policy.act(observation, goal)         # observation: the body's state
+    run = goalgan_bt.open_run(trained.folder)      # in a notebook: run.plot(), run.show()
 
 The curriculum alone, in a loop and a world of one's own. It proposes goals that are neither
 mastered nor hopeless, and is told only how trying went:
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
     from goalgan_bt.learners.run_config import Trained
     from goalgan_bt.learners.table import register_env
     from goalgan_bt.learners.trained_policy import TrainedPolicy, load_policy
+    from goalgan_bt.notebook import OpenRun, open_run
     from goalgan_bt.recall.backtracking import BacktrackingModel
     from goalgan_bt.recall.places import Places, Ways
     from goalgan_bt.recall.settings import BacktrackingConfig, PlacesConfig
@@ -64,6 +66,7 @@ __all__ = [
     "GanConfig",
     "GoalCurriculum",
     "GoalsConfig",
+    "OpenRun",
     "Places",
     "PlacesConfig",
     "RunError",
@@ -73,6 +76,7 @@ __all__ = [
     "UsageError",
     "Ways",
     "load_policy",
+    "open_run",
     "recall_traces",
     "register_env",
     "train",
@@ -86,6 +90,7 @@ _HOME = {
     "GanConfig": "curriculum.settings",
     "GoalCurriculum": "curriculum.curriculum",
     "GoalsConfig": "curriculum.settings",
+    "OpenRun": "notebook",
     "Places": "recall.places",
     "PlacesConfig": "recall.settings",
     "RunError": "runs.errors",
@@ -95,6 +100,7 @@ _HOME = {
     "UsageError": "runs.errors",
     "Ways": "recall.places",
     "load_policy": "learners.trained_policy",
+    "open_run": "notebook",
     "recall_traces": "recall.traces",
     "register_env": "learners.table",
 }

@@ -224,6 +224,8 @@ def test_an_exported_page_plays_without_a_network(browser, folder, tmp_path):
     caption = page.locator("#caption")
     caption.get_by_text(CAPTION).wait_for()
     first = caption.inner_text()
+    assert all(box["width"] < 20 for box in boxes(page, "#legend svg"))  # signs, not pictures
+    assert all(box["width"] > 150 for box in boxes(page, "figure svg"))
     wait_for(page, lambda: caption.inner_text() != first)  # it plays
     page.evaluate("seek(0)")  # what a click on a curve does
     wait_for(page, lambda: caption.inner_text().startswith("Iteration 1 "))
@@ -231,6 +233,13 @@ def test_an_exported_page_plays_without_a_network(browser, folder, tmp_path):
     wait_for(page, lambda: caption.inner_text().startswith("The last policy goes to"))
     assert not [url for url in asked if not url.startswith(("file:", "data:", "blob:", "about:"))]
     context.close()
+
+
+def boxes(page, selector):
+    """Where elements are on a page."""
+    found = page.locator(selector)
+    assert found.count()
+    return [found.nth(i).bounding_box() for i in range(found.count())]
 
 
 def test_it_shows_learning_and_outlives_the_trainer(browser, tmp_path):

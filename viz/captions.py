@@ -46,11 +46,11 @@ def doing(run: Run) -> str:
     """What a run is about at the moment, in a sentence or two for who has never seen one."""
     metrics, over = run.metrics, run.ended() == "complete"
     if run.kind == "running":
-        value = _last_known(metrics, "eval/return")
+        value = metrics.last("eval/return")
         told = "" if value != value else f"; its last measured return is {value:,.0f}"
         return f"{'A body has learned' if over else 'A body learns'} to run{told}."
     if run.kind == "rooms":
-        value = _last_known(metrics, "eval/coverage")
+        value = metrics.last("eval/coverage")
         told = "" if value != value else f" It finds it in {value:.0%} of its tries."
         return f"An agent looks for the goal, which is in the far one of four rooms.{told}"
     world = "box" if run.maze is None else "maze"
@@ -68,7 +68,7 @@ def doing(run: Run) -> str:
 def covers(metrics: Metrics, world: str) -> str:
     """How much of its world a body reaches: one figure, the other in brackets with its date."""
     covered, steps = measured(metrics)
-    estimate = _last_known(metrics, "curriculum/estimated_coverage")
+    estimate = metrics.last("curriculum/estimated_coverage")
     if steps == metrics.last("steps/train") or (estimate != estimate and covered == covered):
         return f"It reaches **{covered:.0%}** of the {world}."
     if estimate != estimate:
@@ -95,17 +95,10 @@ def practised(run: Run, frame: Frame) -> str:
     where = f"{near:.0f} m" if round(near) == round(most) else f"{near:.0f} to {most:.0f} m"
     walls = 0.0 if run.maze is None else 1 - float(run.maze.is_free(goals[:, :2]).mean())
     told = f"Now it practises {where} from the start ({whole})"
-    success = _last_known(run.metrics, "rollout/success")
+    success = run.metrics.last("rollout/success")
     if success == success:
         told += f"; {success:.0%} of its attempts succeed"
     return told + (f", {walls:.0%} of the goals lie in walls." if walls >= 0.005 else ".")
-
-
-def _last_known(metrics: Metrics, name: str) -> float:
-    """The last value of a metric that is known, else NaN."""
-    column = metrics.column(name)
-    known = np.flatnonzero(np.isfinite(column))
-    return float(column[known[-1]]) if len(known) else np.nan
 
 
 def measured(metrics: Metrics) -> tuple[float, float]:

@@ -97,7 +97,7 @@ def legend(kind: str) -> str:
     else:
         goals = [(goal.text, _shape(goal)) for goal in palette.GOALS.values()]
         rows = [
-            [("Goals that it practises (remembered ones smaller):", ""), *goals],
+            [("Goals it practises (remembered: smaller)", ""), *goals],
             [("start", _dot(START)), ("goal of the body", _ring()), ("its trail", _line())],
             [("way to the ring, as recalled", _arrow()), ("recall trace", _line(TRACE))],
         ]

@@ -53,6 +53,11 @@ class PageProcess:
         )
         threading.Thread(target=self._listen, daemon=True).start()
 
+    def wait(self, seconds: float) -> str | None:
+        """Its address, as soon as it listens; None where it does not in that time."""
+        self._known.wait(seconds)
+        return self._address
+
     def close(self) -> None:
         """End the page; in a terminal, after a run that ended well, only when people are done."""
         if self._process is None:

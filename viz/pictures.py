@@ -1,6 +1,7 @@
 """Pictures of run folders with matplotlib: coverage over steps, coverage over the maze."""
 
 import contextlib
+import io
 import math
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -153,7 +154,7 @@ def _around(ax: Axes, runs: list[Measured]) -> None:
     if measure == "coverage":
         ax.set_ylim(0, 1.02)
     ax.grid(alpha=0.25)
-    ax.legend(fontsize=_small(7), frameon=False, loc="best")
+    ax.legend(fontsize=_small(7), loc="best", framealpha=0.75, edgecolor="none")
 
 
 def _title(run: Run) -> str:
@@ -232,6 +233,15 @@ def frames_at(folder: Path, iterations: tuple[int, ...]) -> list[Path]:
 FEW = 6  # runs, each of which has a line and maps of its own
 
 
+class Picture(Figure):
+    """A figure that a notebook shows by itself."""
+
+    def _repr_png_(self) -> bytes:
+        file = io.BytesIO()
+        self.savefig(file, format="png", dpi=100)
+        return file.getvalue()
+
+
 def overview(
     folders: list[Path], maps: int = 4, at: tuple[int, ...] = (), width: float | None = None
 ) -> Figure:
@@ -261,7 +271,7 @@ def overview(
     across = max(2.4 * columns, 5.5 * panels) if width is None else width * MM
     of_maps = 1.1 * across / columns * len(with_maze) + 0.35 * bool(with_maze)
     of_curves = max(1.8, 0.55 * across / panels)
-    figure = Figure(figsize=(across, of_maps + of_curves), layout="constrained")
+    figure = Picture(figsize=(across, of_maps + of_curves), layout="constrained")
     heights = [height for height in (of_maps, of_curves) if height]
     *above, below = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False).flat
     for part in above:

@@ -235,12 +235,12 @@ class Scene:
         corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
         points, _ = segments(corners[:, None])
         self._lines("walls", points - np.array([0, 0, 0.25], np.float32), (150, 150, 150), 2.0)
-        beyond = 0.03 * self.size
+        beyond = 0.05 * self.size
         for axis, (x, y) in enumerate((((x0 + x1) / 2, y0 - beyond), (x0 - beyond, (y0 + y1) / 2))):
-            self._label(f"axis{axis}", f"dimension {axis + 1} of {dims}, m", x, y)
-            for value in (self._first[axis], 0.0, self._last[axis]):
-                there = (value, y0 - beyond / 2) if axis == 0 else (x0 - beyond / 2, value)
-                self._label(f"axis{axis}_{value:.0f}", f"{value:g}", *there)
+            self._label(f"axis{axis}", f"dimension {axis + 1} of {dims}, m", x, y, size=0.03)
+            for value in (self._first[axis], self._last[axis]):
+                there = (value, y0 - beyond) if axis == 0 else (x0 - beyond, value)
+                self._label(f"axis{axis}_{value:.0f}", f"{value:g}", *there, size=0.03)
 
     def _draw_name(self, name: str, colour: str) -> None:
         """A run's name above its maze, in the colour of its curve."""
@@ -256,14 +256,15 @@ class Scene:
         )
         self._label("name/text", name, self.centre[0], top + 0.08 * self.size)
 
-    def _label(self, node: str, text: str, x: float, y: float) -> None:
+    def _label(self, node: str, text: str, x: float, y: float, size: float = 0.06) -> None:
+        """A text at a place, as high as that share of the scene's size."""
         self._scene.add_label(
             f"{self._prefix}/{node}",
             text,
             position=(x, y, 0.0),
             anchor="center-center",
             font_size_mode="scene",
-            font_scene_height=0.06 * self.size,
+            font_scene_height=size * self.size,
         )
 
     def _draw_tiles(

@@ -147,6 +147,11 @@ class Metrics:
                         self._columns[name].append(value)
         return True
 
+    @property
+    def names(self) -> list[str]:
+        """Of the metrics, in the order of the table."""
+        return list(self._columns)
+
     def column(self, name: str) -> NDArray[np.float64]:
         """A metric over the rows, (n,), NaN where it is missing or no number."""
         return np.array(self._columns.get(name, [math.nan] * len(self)), dtype=float)
