@@ -25,6 +25,7 @@ def make(
     action_repeat: int = 1,
     integrator: str = "implicitfast",
     dim: int = 2,
+    cell_size: float = 2.0,
     map_file: Path | None = None,
     maze: mazes.Maze | None = None,
     physics: str = "mujoco",
@@ -41,6 +42,7 @@ def make(
         action_repeat: steps for which each action is held.
         integrator: `implicitfast` or `rk4`, for MuJoCo bodies.
         dim: dimensions of `point_nd`, 2 to 6.
+        cell_size: side of a cell of a maze, metres.
         map_file: a text map that replaces the layout (see `goalgan_bt.envs.maze`).
         maze: a maze that replaces both, for example the one that a run has recorded.
         physics: `mujoco`, or `warp` for mujoco-warp (extra `gpu`), for MuJoCo bodies.
@@ -83,10 +85,14 @@ def make(
             env.name = body
             return env
     if maze is None:
-        maze = mazes.layout(layout) if map_file is None else mazes.load(map_file)
+        if map_file is None:
+            maze = mazes.layout(layout, cell_size)
+        else:
+            maze = mazes.load(map_file, cell_size)
     if horizon is None:
         usual = HORIZON[body] if mine is None else make_body.usual_horizon
-        scale = maze.longest_path / mazes.layout("umaze").longest_path
+        usual_maze = mazes.layout("umaze")
+        scale = maze.longest_path * maze.cell_size / usual_maze.longest_path / usual_maze.cell_size
         horizon = max(usual, 100 * round(usual * scale / 100))
     settings = maze, integrator, num_envs, horizon, action_repeat, threads, physics, device
     env = make_body(*settings) if mine is None else own.made(name, make_body, *settings)

@@ -454,3 +454,23 @@ def test_the_studies_that_come_along_can_be_run(name):
     spec = plan.load(name)
     assert len(plan.grid(spec)) == len(spec.seeds) * len(spec.methods) * len(spec.envs)
     assert {"recall_traces", "traces_only"} & spec.methods.keys()
+
+
+def test_a_study_of_a_map_of_ones_own_is_titled_by_it(tmp_path):
+    """And nothing that was published for the usual maze is drawn over it."""
+    (tmp_path / "my.txt").write_text("#####\n#S..#\n#####\n")
+    (tmp_path / "own.toml").write_text(
+        TINY.replace("--iterations 25", f"--iterations 25 --map {tmp_path / 'my.txt'}")
+    )
+    curve = Curve(np.array([0.0, 50.0, 100.0]), np.array([0.0, 0.2, 0.5]))
+    runs = {("point_umaze", "goal_gan"): {0: curve}}
+    own, usual = (plan.load(str(path)) for path in (tmp_path / "own.toml", tiny_file(tmp_path)))
+    (ax,) = report.draw(own, runs).axes
+    assert ax.get_title() == "point_my" and not ax.texts
+    (ax,) = report.draw(usual, runs).axes
+    assert ax.get_title() == "point_umaze" and len(ax.texts) == 2
+
+
+def tiny_file(folder):
+    (folder / "tiny.toml").write_text(TINY)
+    return folder / "tiny.toml"

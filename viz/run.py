@@ -48,9 +48,7 @@ class Run:
         self.settings = run_folder.settings_of(folder)
         if "env" not in self.settings:
             raise RunError(f"{folder} is no run: it has no readable config.json")
-        self.env, own_map = str(self.settings["env"]), self.settings.get("map")
-        body = self.env.rpartition(":")[2].split("_")[0].lower()
-        self.task = self.env if own_map is None else f"{body}_{Path(str(own_map)).stem}"
+        self.env, self.task = str(self.settings["env"]), run_folder.task_of(self.settings)
         self.kind = _kind_of(self.env)
         self.iterations: list[int] = []
         self.metrics = Metrics(folder / "metrics.csv")

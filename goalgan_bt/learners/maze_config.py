@@ -51,6 +51,8 @@ class MazeConfig(RunConfig):
     alone does not repeat the run."""
     map: Path | None = None
     """Text map that replaces the maze: '#' wall, '.' free, 'S' start."""
+    cell_size: Annotated[float, between(0.5, 20.0)] = 2.0
+    """Side of a cell of the maze, metres."""
     dim: Annotated[int, Range("2 to 6", 2, 6)] = 2
     """Dimensions of point_nd, 2 to 6."""
     horizon: Annotated[int | None, between(1, 10**6)] = None
@@ -94,8 +96,16 @@ class MazeConfig(RunConfig):
 
 
 # What a resumed run may change: another world or other randomness would be another run.
-FIXED = {"env", "method", "seed", "map", "dim", "horizon", "action_repeat", "integrator"}
-MAY_CHANGE = frozenset(field.name for field in fields(MazeConfig)) - FIXED - {"physics", "out"}
+FIXED = {"env", "method", "seed", "map", "cell_size", "dim", "horizon", "action_repeat"}
+MAY_CHANGE = (
+    frozenset(field.name for field in fields(MazeConfig))
+    - FIXED
+    - {
+        "integrator",
+        "physics",
+        "out",
+    }
+)
 
 ANT = MazeConfig(
     env="ant_umaze",
@@ -241,6 +251,8 @@ def check(cfg: MazeConfig) -> None:
         raise UsageError("--horizon must be a multiple of --action-repeat")
     if cfg.map is not None and cfg.env == "point_nd":
         raise UsageError("point_nd has no walls: --map goes with point_... and ant_... mazes")
+    if cfg.cell_size != 2.0 and cfg.env == "point_nd":
+        raise UsageError("point_nd has no cells: --cell-size goes with mazes")
     if cfg.physics == "warp" and cfg.env == "point_nd":
         raise UsageError(
             "point_nd is no MuJoCo model: --physics warp goes with point_... and ant_..."
@@ -279,6 +291,7 @@ def make_env(cfg: MazeConfig, num_envs: int, maze: Maze | None = None) -> GoalEn
         action_repeat=cfg.action_repeat,
         integrator=cfg.integrator,
         dim=cfg.dim,
+        cell_size=cfg.cell_size,
         map_file=cfg.map,
         maze=maze,
         physics=cfg.physics,

@@ -185,6 +185,13 @@ def settings_of(folder: Path) -> dict[str, Any]:
         return {}
 
 
+def task_of(settings: Mapping[str, Any]) -> str:
+    """What is learned with these settings: the environment, or its body and a map of one's own."""
+    env, own_map = str(settings["env"]), settings.get("map")
+    body = env.rpartition(":")[2].split("_")[0].lower()
+    return env if own_map is None else f"{body}_{Path(str(own_map)).stem}"
+
+
 def flat(settings: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
     """Nested settings by name, those of a part as `trpo.max_kl`."""
     for name, value in settings.items():

@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 from goalgan_bt.runs import files
 from goalgan_bt.runs.errors import UsageError
 from goalgan_bt.runs.metrics_csv import write_table
+from goalgan_bt.runs.run_folder import task_of
 from goalgan_bt.study.plan import Study, Trial, grid, settings
-from goalgan_bt.study.published import published
+from goalgan_bt.study.published import Published, published
 from goalgan_bt.study.statistics import Curve, areas, ends, interval, iqm, paired, ratio, time_to
 from goalgan_bt.study.tables import Tables
 
@@ -206,7 +207,9 @@ def draw(study: Study, runs: dict[tuple[str, str], dict[int, Curve]]) -> Figure:
     axes = figure.subplots(down, across, squeeze=False).flat
     for ax, env in zip(axes, envs, strict=False):
         of = {method: runs.get((env, method), {}) for method in methods}
-        _curves(ax, env, of, study.measure)
+        learned = asdict(settings(Trial(env, "", 0, study.flags)))
+        title = env if learned.get("map") is None else task_of(learned)
+        _curves(ax, title, of, study.measure, published(learned))
     if panels > len(envs):
         _ends(axes[len(envs)], envs, runs, methods)
     for ax in axes[panels:]:
@@ -214,7 +217,13 @@ def draw(study: Study, runs: dict[tuple[str, str], dict[int, Curve]]) -> Figure:
     return figure
 
 
-def _curves(ax: Axes, env: str, of: dict[str, dict[int, Curve]], measure: str) -> None:
+def _curves(
+    ax: Axes,
+    title: str,
+    of: dict[str, dict[int, Curve]],
+    measure: str,
+    lines: tuple[Published, ...],
+) -> None:
     """Interquartile mean per method, with its interval if there are few, and what was published."""
     for i, (method, seeds) in enumerate(of.items()):
         if not seeds:
@@ -232,14 +241,13 @@ def _curves(ax: Axes, env: str, of: dict[str, dict[int, Curve]], measure: str) -
         ax.plot(grid / 1e6, bounds[:, 0], label=f"{method} ({len(seeds)})", **style)
         if len(of) <= 10:  # more would hide the lines; the table has the intervals
             ax.fill_between(grid / 1e6, *bounds[:, 1:].T, color=style["color"], alpha=0.12, lw=0)
-    lines = published(asdict(settings(Trial(env, "", 0, ""))))
     for line, (x, side) in zip(lines, ((0, "left"), (1, "right")), strict=False):
         steps, level = line.last
         name = f"{line.method}, published, {steps / 1e6:.0f}M steps"
         ax.axhline(level, color="0.6", lw=0.8, ls=":")
         at = ax.get_yaxis_transform()  # x as a share of the axis, y as it is
         ax.text(x, level, name, transform=at, fontsize=7, color="0.4", va="bottom", ha=side)
-    ax.set(title=env, xlabel="million environment steps of training", ylabel=measure)
+    ax.set(title=title, xlabel="million environment steps of training", ylabel=measure)
     _finish(ax, measure)
 
 

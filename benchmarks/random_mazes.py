@@ -1,0 +1,109 @@
+"""How coverage after a budget depends on the length of the longest way: twenty random mazes.
+
+    python benchmarks/random_mazes.py --env point --json docs/runs/random_mazes_point.json
+    python benchmarks/random_mazes.py --env ant --json docs/runs/random_mazes_ant.json
+    python benchmarks/random_mazes.py --draw docs/pictures/random_mazes.png
+
+Each maze is one run of the default settings, of seed 0, with a fixed budget. The untrained policy
+is measured as well: what a body covers that has learned nothing.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import tyro
+
+from goalgan_bt.envs.random_maze import random_maze
+from goalgan_bt.runs.metrics_csv import read_metrics
+
+RUNS = Path(__file__).parents[1] / "docs/runs"
+STEPS = {"point": 2_000_000, "ant": 4_000_000}
+SIZES = tuple((rows, columns) for rows in (1, 2, 3, 4) for columns in (2, 2, 3, 3, 4))
+
+
+@dataclass(frozen=True)
+class RandomConfig:
+    """Train in random mazes of 3x5 to 9x9 cells."""
+
+    env: Literal["point", "ant"] = "point"
+    """The body."""
+    mazes: int = 20
+    """How many."""
+    steps: int | None = None
+    """Environment steps of training in each; by default 2 million (point) or 4 million (ant)."""
+    json: Path | None = None
+    """Where to write the rows."""
+    draw: Path | None = None
+    """Instead, draw the rows that are known."""
+
+
+def main(cfg: RandomConfig) -> None:
+    if cfg.draw is not None:
+        draw(cfg.draw)
+        return
+    rows = []
+    with tempfile.TemporaryDirectory() as directory:
+        for i in range(cfg.mazes):
+            maze = random_maze(SIZES[i % len(SIZES)], np.random.default_rng(i))
+            path = Path(directory) / f"random_{i}.txt"
+            path.write_text("\n".join(maze.rows) + "\n")
+            row = {"maze": list(maze.rows), "longest_way": maze.longest_path * maze.cell_size}
+            row |= trained(cfg, path, Path(directory) / "runs")
+            rows.append(row)
+            print(json.dumps(row | {"maze": i}), flush=True)
+            if cfg.json is not None:
+                cfg.json.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+def trained(cfg: RandomConfig, maze: Path, out: Path) -> dict[str, float]:
+    """Coverage in a maze before and after training, and what that took."""
+    steps = cfg.steps or STEPS[cfg.env]
+    words = [sys.executable, "-m", "goalgan_bt.train", "--env", f"{cfg.env}_umaze", "--viz", "none"]
+    words += ["--map", str(maze), "--out", str(out), "--threads", "1"]
+    first = ["--iterations", "1", "--policy.init-std", "0.2", "--trpo.max-kl", "1e-9"]
+    found = {}
+    for name, more in (("untrained", first), ("trained", ["--total-steps", str(steps)])):
+        done = subprocess.run([*words, *more], capture_output=True, text=True)
+        if done.returncode:
+            raise SystemExit(done.stderr)
+        folder = Path(done.stdout.splitlines()[0].removeprefix("run folder: "))
+        _, table = read_metrics(folder)
+        found[name] = float(table[-1]["eval/coverage"])
+    found["steps"] = int(table[-1]["steps/train"])
+    found["seconds"] = round(float(table[-1]["time/total"]))
+    found["floor"] = float(table[-1]["eval/floor"])
+    return found
+
+
+def draw(path: Path) -> None:
+    """Coverage over the longest way."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 3.6), layout="constrained")
+    ax = figure.subplots()
+    for i, body in enumerate(STEPS):
+        known = RUNS / f"random_mazes_{body}.json"
+        if not known.exists():
+            continue
+        rows = json.loads(known.read_text())
+        way = [row["longest_way"] for row in rows]
+        label = f"{body}, {rows[0]['steps'] / 1e6:.0f} million steps"
+        ax.plot(way, [row["trained"] for row in rows], "os"[i], color=f"C{i}", label=label)
+        untrained = [row["untrained"] for row in rows]
+        ax.plot(
+            way, untrained, "os"[i], color=f"C{i}", mfc="none", ms=4, label=f"{body}, untrained"
+        )
+    ax.set(xlabel="longest way from the start, metres", ylabel="coverage", ylim=(0, 1.02))
+    ax.grid(alpha=0.25)
+    ax.legend(fontsize=7)
+    figure.savefig(path, dpi=150)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(RandomConfig, description=__doc__))
