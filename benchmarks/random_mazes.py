@@ -53,7 +53,7 @@ def main(cfg: RandomConfig) -> None:
             maze = random_maze(SIZES[i % len(SIZES)], np.random.default_rng(i))
             path = Path(directory) / f"random_{i}.txt"
             path.write_text("\n".join(maze.rows) + "\n")
-            row = {"maze": list(maze.rows), "longest_way": maze.longest_path * maze.cell_size}
+            row = {"maze": list(maze.rows), "longest_way": maze.longest_way}
             row |= trained(cfg, path, Path(directory) / "runs")
             rows.append(row)
             print(json.dumps(row | {"maze": i}), flush=True)

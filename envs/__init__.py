@@ -85,14 +85,11 @@ def make(
             env.name = body
             return env
     if maze is None:
-        if map_file is None:
-            maze = mazes.layout(layout, cell_size)
-        else:
-            maze = mazes.load(map_file, cell_size)
+        whole = mazes.layout(layout) if map_file is None else mazes.load(map_file)
+        maze = mazes.Maze(whole.rows, cell_size)
     if horizon is None:
         usual = HORIZON[body] if mine is None else make_body.usual_horizon
-        usual_maze = mazes.layout("umaze")
-        scale = maze.longest_path * maze.cell_size / usual_maze.longest_path / usual_maze.cell_size
+        scale = maze.longest_way / mazes.layout("umaze").longest_way
         horizon = max(usual, 100 * round(usual * scale / 100))
     settings = maze, integrator, num_envs, horizon, action_repeat, threads, physics, device
     env = make_body(*settings) if mine is None else own.made(name, make_body, *settings)

@@ -172,6 +172,11 @@ class Maze:
         """Steps from the start cell to the free cell farthest from it."""
         return int(self._steps.max())
 
+    @property
+    def longest_way(self) -> float:
+        """From the start cell to the free cell farthest from it, metres along the corridors."""
+        return self.cell_size * self.longest_path
+
     @cached_property
     def _steps(self) -> NDArray[np.int64]:
         """Steps from the start cell to each cell, -1 to walls."""

@@ -38,8 +38,11 @@ def test_the_command_line_overrides_the_preset(env):
         (["--backtracking.trace-length", "1000000000"], "trace_length times traces must be"),
         (["--goals.r-min", "0.9"], "--goals.r-min must be less"),
         (["--no-such-flag", "1"], "no-such-flag"),
-        (["--seed", "three"], "--seed cannot be 'three'; --help tells what it takes"),
-        (["--total-steps", "1.5e0"], "--total-steps cannot be '1.5e0'; --help tells what it takes"),
+        (["--seed", "three"], "--seed cannot be 'three'; --help-all tells what it takes"),
+        (
+            ["--total-steps", "1.5e0"],
+            "--total-steps cannot be '1.5e0'; --help-all tells what it takes",
+        ),
         (["--dim", "3"], "--dim goes with point_nd: ant_umaze has two dimensions"),
         (["--resume", "nowhere"], "nowhere is no run"),
         (["--policy.final-std", "0"], "--policy.final-std must be greater than 0"),
@@ -106,7 +109,7 @@ def test_damaged_settings_are_refused(tmp_path, text):
 
 def test_help_explains_every_setting(capsys):
     with pytest.raises(SystemExit) as stop:
-        table.from_command_line(["--help"])
+        table.from_command_line(["--help-all"])
     assert stop.value.code == 0
     text = capsys.readouterr().out
     assert "--backtracking.trace-length" in text and "--rollout.chain" in text

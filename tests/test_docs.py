@@ -61,6 +61,7 @@ def of(module):
 def filled(words, folder):
     """With a run in the place of RUN, and a seed in that of S."""
     words = words.replace("[RUN ...]", "").replace("RUN", str(folder))
+    words = re.sub(r"^runs\b", str(folder.parent), words)  # a folder of runs
     return shlex.split(re.sub(r"\bS\b", "3", words))
 
 
@@ -85,7 +86,7 @@ def test_every_documented_training_runs(words, tmp_path, folder, monkeypatch):
         if own[1] == "quadruped":
             pytest.importorskip("dm_control")
     argv = filled(words, folder)
-    if "--help" in argv:
+    if {"--help", "--help-all"} & set(argv):
         assert call("train", *argv).returncode == 0
         return
     cfg = table.from_command_line(argv)

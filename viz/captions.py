@@ -83,8 +83,7 @@ def practised(run: Run, frame: Frame) -> str:
     some = goals[kinds == 0] if (kinds == 0).any() else goals
     if run.maze is not None:
         far = run.maze.way_from_start(some[:, :2])
-        end = run.maze.cell_size * run.maze.longest_path
-        whole = f"the farthest place of the maze is {end:.0f} m away"
+        whole = f"the farthest place of the maze is {run.maze.longest_way:.0f} m away"
     else:
         far = np.linalg.norm(some, axis=1)
         whole = "as the crow flies"
