@@ -13,7 +13,12 @@ if TYPE_CHECKING:
     from goalgan_bt.envs.goal_env import GoalEnv
 
 HORIZON = {"point": 200, "ant": 500}  # steps of an episode in the U-maze
-NAMES = (*(f"{body}_{layout}" for body in HORIZON for layout in mazes.LAYOUTS), "point_nd")
+OFFICIAL = tuple(f"{b}_{layout}_gym" for b in HORIZON for layout in ("umaze", "medium", "large"))
+NAMES = (
+    *(f"{body}_{layout}" for body in HORIZON for layout in mazes.LAYOUTS),
+    *OFFICIAL,  # gymnasium-robotics' own
+    "point_nd",
+)
 
 
 def make(
@@ -40,7 +45,7 @@ def make(
         horizon: steps of an episode. If None: 200 for a point, 500 for an Ant in the U-maze, and
             in other mazes more, in proportion to the longest way from the start.
         action_repeat: steps for which each action is held.
-        integrator: `implicitfast` or `rk4`, for MuJoCo bodies.
+        integrator: `implicitfast`, `rk4` or the body's `own`, for MuJoCo bodies.
         dim: dimensions of `point_nd`, 2 to 6.
         cell_size: side of a cell of a maze, metres.
         map_file: a text map that replaces the layout (see `goalgan_bt.envs.maze`).
@@ -69,6 +74,11 @@ def make(
         if physics == "warp":
             raise PhysicsError("point_nd is no MuJoCo model: warp goes with point_... and ant_...")
         return PointND(dim, num_envs, horizon or 200, action_repeat)
+    if name in OFFICIAL:
+        from goalgan_bt.envs import official
+
+        how = action_repeat, threads, physics, device
+        return official.make(name, maze, integrator, num_envs, horizon, *how)
     make_body: Any
     if mine is None:
         body, layout = name.split("_")

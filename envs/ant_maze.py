@@ -15,7 +15,7 @@ import numpy as np
 
 from goalgan_bt.envs.arrays import Array, columns, like, namespace
 from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
-from goalgan_bt.envs.mujoco_env import INTEGRATORS, MazeEnv, add_walls
+from goalgan_bt.envs.mujoco_env import MazeEnv, add_walls, set_integrator
 from goalgan_bt.envs.rotations import (
     ahead_and_left,
     axes_on_map,
@@ -46,7 +46,7 @@ def build_model(maze: Maze, integrator: str) -> mujoco.MjModel:
     path = Path(gymnasium.__file__).parent / "envs/mujoco/assets/ant.xml"
     spec = mujoco.MjSpec.from_file(str(path))
     spec.option.timestep = 0.02
-    spec.option.integrator = INTEGRATORS[integrator]
+    set_integrator(spec, integrator)
     add_walls(spec, maze, height=1.0, collide=True)
     for geom in spec.geoms:
         geom.solref[:2] = [0.02, 1.0]

@@ -72,6 +72,7 @@ class Maze:
     Args:
         rows: the map, top row first (see the module docstring).
         cell_size: side of a cell in metres (2.0 in the original).
+        start: where the middle of the start cell is, metres.
 
     Raises:
         MapError: if the map is not rectangular, has an unknown character, an open border, no
@@ -80,6 +81,7 @@ class Maze:
 
     rows: tuple[str, ...]
     cell_size: float = 2.0
+    start: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         _check(self.rows)
@@ -101,7 +103,7 @@ class Maze:
     def low(self) -> FloatArray:
         """Lower corner of the whole map, walls included, (2,), metres."""
         r, c = self._start
-        return -self.cell_size * (np.array([c, r]) + 0.5)
+        return np.array(self.start) - self.cell_size * (np.array([c, r]) + 0.5)
 
     @cached_property
     def high(self) -> FloatArray:

@@ -134,6 +134,12 @@ INTEGRATORS = {
 }
 
 
+def set_integrator(spec: mujoco.MjSpec, name: str) -> None:
+    """Let a model have the integrator of that name; `own`: the one that it has."""
+    if name != "own":
+        spec.option.integrator = INTEGRATORS[name]
+
+
 OURS = "goalgan_bt_"  # how the names of what is added to a model begin
 
 

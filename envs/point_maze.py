@@ -14,7 +14,7 @@ import numpy as np
 from goalgan_bt.envs.arrays import Array, namespace, put
 from goalgan_bt.envs.goal_env import Ids, observed
 from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
-from goalgan_bt.envs.mujoco_env import INTEGRATORS, MazeEnv, add_walls
+from goalgan_bt.envs.mujoco_env import MazeEnv, add_walls, set_integrator
 
 RADIUS = 0.1  # m
 
@@ -27,7 +27,7 @@ def build_model(maze: Maze, integrator: str) -> mujoco.MjModel:
     path = Path(package.origin).parent / "envs/assets/point/point.xml"
     spec = mujoco.MjSpec.from_file(str(path))
     spec.option.timestep = 0.02
-    spec.option.integrator = INTEGRATORS[integrator]
+    set_integrator(spec, integrator)
     spec.geom("particle_geom").density = 100.0
     spec.geom("particle_geom").rgba = [0.9, 0.35, 0.15, 1.0]
     for joint in spec.joints:

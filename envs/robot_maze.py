@@ -22,7 +22,7 @@ import numpy as np
 from goalgan_bt.envs.arrays import Array, like, namespace
 from goalgan_bt.envs.goal_env import Ids, PhysicsError
 from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
-from goalgan_bt.envs.mujoco_env import INTEGRATORS, OURS, MazeEnv, add_walls
+from goalgan_bt.envs.mujoco_env import OURS, MazeEnv, add_walls, set_integrator
 from goalgan_bt.envs.rotations import (
     ahead_and_left,
     axes_on_map,
@@ -78,7 +78,7 @@ class RobotMaze(MazeEnv):
             PhysicsError: for a model that cannot be such a robot.
         """
         spec = cls.robot()
-        spec.option.integrator = INTEGRATORS[integrator]
+        set_integrator(spec, integrator)
         add_walls(spec, maze, height=cls.wall_height, collide=True)
         floors = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD
         if not any(geom.type in floors for geom in spec.worldbody.geoms):

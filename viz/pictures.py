@@ -197,7 +197,7 @@ def coverage_map(ax: Axes, folder: Path, frame: Path, goals: float = 7.0) -> Any
             x, y = arrays["goals"][labels(arrays) == label, :2].T
             dots = ax.scatter(x, y, s=goals, marker=kind.marker, label=kind.text, lw=0.4)
             dots.set(facecolor=palette.css(kind.fill), edgecolor=palette.css(kind.rim))
-    ax.plot(0, 0, marker="*", color="white", markeredgecolor="#111111", markersize=9)
+    ax.plot(*maze.start, marker="*", color="white", markeredgecolor="#111111", markersize=9)
     (x0, y0), (x1, y1) = drawn(maze, np.stack([maze.low, maze.high]))
     ax.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xticks=[], yticks=[])
     mean = np.mean(rate > 0 if what == "visits" else rate)

@@ -3,7 +3,6 @@
 Each layer is one node that is replaced in place; a frame of a run fills them all.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -116,7 +115,7 @@ class Scene:
         elif run.maze is None:
             self._draw_axes(box.shape[1])
         else:
-            self._draw_maze()
+            self._draw_maze(run.maze)
         if colour is not None:
             self._draw_name(run.task_and_method(), colour)
 
@@ -203,7 +202,7 @@ class Scene:
     def _name(self, layer: str, node: str = "node") -> str:
         return f"{self._prefix}/{layer}/{node}"
 
-    def _draw_maze(self) -> None:
+    def _draw_maze(self, maze: Maze) -> None:
         width, height = self._last - self._first + 0.08 * self.size
         self._scene.add_box(
             f"{self._prefix}/floor",
@@ -213,8 +212,7 @@ class Scene:
             cast_shadow=False,
             receive_shadow=False,
         )
-        boxes: Sequence[FloatArray] = [] if self._maze is None else list(self._maze.walls())
-        for i, box in enumerate(boxes):
+        for i, box in enumerate(maze.walls()):
             x0, y0 = np.maximum(box[:2], self._first)
             x1, y1 = np.minimum(box[2:], self._last)
             self._scene.add_box(
@@ -226,7 +224,7 @@ class Scene:
                 receive_shadow=False,
             )
         self._scene.add_icosphere(
-            f"{self._prefix}/start", radius=0.1, color=START, position=(0.0, 0.0, 0.1)
+            f"{self._prefix}/start", radius=0.1, color=START, position=(*maze.start, 0.1)
         )
 
     def _draw_axes(self, dims: int) -> None:

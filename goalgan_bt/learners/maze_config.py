@@ -57,8 +57,9 @@ class MazeConfig(RunConfig):
     """Dimensions of point_nd, 2 to 6."""
     horizon: Annotated[int | None, between(1, 10**6)] = None
     """Steps of an episode; by default 200 (point) or 500 (ant), more in longer mazes."""
-    integrator: Literal["implicitfast", "rk4"] = "implicitfast"
-    """MuJoCo's integrator; rk4 is the original's and costs four times as much."""
+    integrator: Literal["implicitfast", "rk4", "own"] = "implicitfast"
+    """MuJoCo's integrator; rk4 is the original's and costs four times as much; own is that of the
+    body's model, which the official tasks (..._gym) have."""
     physics: Literal["mujoco", "warp"] = "mujoco"
     """What simulates: MuJoCo on the CPU, or mujoco-warp, in single precision (extra `gpu`)."""
     device: str = "auto"
@@ -173,6 +174,10 @@ def preset(env: str, method: str | None = None) -> MazeConfig:
             places=replace(cfg.places, way="straight"),
             imitation=replace(cfg.imitation, source="traces"),
         )
+    if env in envs.OFFICIAL:
+        # A step of the Ant is 0.05 s there, one of the point 0.01 s.
+        repeat = 1 if env.startswith("ant") else 5
+        cfg = replace(cfg, integrator="own", action_repeat=repeat)
     return cfg if method is None else with_method(cfg, method)
 
 
@@ -251,6 +256,8 @@ def check(cfg: MazeConfig) -> None:
         raise UsageError("--horizon must be a multiple of --action-repeat")
     if cfg.map is not None and cfg.env == "point_nd":
         raise UsageError("point_nd has no walls: --map goes with point_... and ant_... mazes")
+    if cfg.env in envs.OFFICIAL and (cfg.map is not None or cfg.cell_size != 2.0):
+        raise UsageError(f"{cfg.env} is an official maze: it takes no --map and no --cell-size")
     if cfg.cell_size != 2.0 and cfg.env == "point_nd":
         raise UsageError("point_nd has no cells: --cell-size goes with mazes")
     if cfg.physics == "warp" and cfg.env == "point_nd":

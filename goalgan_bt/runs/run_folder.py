@@ -23,7 +23,7 @@ import time
 import types
 import typing
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
@@ -103,7 +103,7 @@ def write_meta(folder: Path, maze: Maze | None) -> None:
         "python": platform.python_version(),
         "cores": len(os.sched_getaffinity(0)),
         "versions": versions,
-        "maze": None if maze is None else {"rows": maze.rows, "cell_size": maze.cell_size},
+        "maze": None if maze is None else asdict(maze),
     }
     write_json(folder / "meta.json", meta)
 
@@ -283,6 +283,9 @@ def maze_of(folder: Path) -> Maze | None:
         side = float(maze["cell_size"])
         if not 0 < side < 1e3:
             raise ValueError(f"cells of {side} m")
-        return Maze(tuple(maze["rows"]), side)
+        x, y = map(float, maze.get("start", (0.0, 0.0)))
+        if not max(abs(x), abs(y)) < 1e6:
+            raise ValueError(f"a start at {x}, {y}")
+        return Maze(tuple(maze["rows"]), side, (x, y))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise RunError(f"{folder / 'meta.json'} is damaged: {error!r}") from None

@@ -1,0 +1,66 @@
+"""gymnasium-robotics' mazes: ours are theirs, bit for bit."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from goalgan_bt import envs
+
+IDS = {
+    "point_umaze_gym": "PointMaze_UMaze-v3",
+    "point_large_gym": "PointMaze_Large-v3",
+    "ant_umaze_gym": "AntMaze_UMaze-v5",
+    "ant_medium_gym": "AntMaze_Medium-v5",
+}
+
+
+def theirs(name):
+    import gymnasium
+    import gymnasium_robotics
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        gymnasium.register_envs(gymnasium_robotics)
+        return gymnasium.make(IDS[name])
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_a_thousand_random_steps_are_the_official_environments_bit_for_bit(name):
+    env, steps = theirs(name), 1000
+    obs, _ = env.reset(seed=3)
+    inner = env.unwrapped
+    ours = envs.make(name, 3, threads=1, integrator="own", horizon=10**6)
+    state = np.concatenate([inner.data.qpos, inner.data.qvel])
+    ids = np.arange(3)
+    ours.reset(ids, np.zeros((3, 2)), np.tile(state, (3, 1)))
+    rng = np.random.default_rng(0)
+    for t in range(steps):
+        action = rng.uniform(-1, 1, inner.action_space.shape)
+        obs, _, terminated, _, info = inner.step(action)
+        assert not terminated
+        ours.advance(ids, np.tile(action, (3, 1)))
+        now = ours.read_states(ids)
+        wanted = np.concatenate([inner.data.qpos, inner.data.qvel])
+        assert np.array_equal(now, np.tile(wanted, (3, 1))), t
+        assert np.array_equal(ours.achieved_goals(now)[1], obs["achieved_goal"])
+        goal = inner.goal[None]
+        assert bool(ours.reached(ours.achieved_goals(now[:1]), goal)[0]) == info["success"]
+    env.close()
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_horizons_cells_and_places_are_the_official_ones(name):
+    env = theirs(name)
+    ours = envs.make(name, 1, threads=1)
+    assert ours.horizon == env.spec.max_episode_steps
+    official = env.unwrapped.maze
+    assert ours.maze.cell_size == official.maze_size_scaling
+    free = {tuple(np.round(place, 9)) for place in official.unique_goal_locations}
+    assert {tuple(np.round(place, 9)) for place in ours.maze.cell_centres()} == free
+    assert ours.feasible(np.array(official.unique_goal_locations)).all()
+    start = ours.achieved_goals(ours.start_state[None])[0]
+    assert tuple(np.round(start, 9)) in free
+    inner = env.unwrapped
+    assert ours.dt == pytest.approx((inner.ant_env if "ant" in name else inner.point_env).dt)
+    env.close()
