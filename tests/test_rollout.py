@@ -10,11 +10,13 @@ from goalgan_bt.agent.rollout import Collector
 from goalgan_bt.agent.settings import PolicyConfig, RolloutConfig
 
 
-def make(name="point_umaze", n=16, steps=40, chain=0.0, horizon=25, seed=0, keep="successes"):
+def make(
+    name="point_umaze", n=16, steps=40, chain=0.0, horizon=25, seed=0, keep="successes", patience=0
+):
     torch.manual_seed(seed)
     env = envs.make(name, n, threads=1, horizon=horizon)
     policy = GaussianPolicy(env.obs_dim, env.act_dim, PolicyConfig(hidden=(8,), init_std=1.0))
-    cfg = RolloutConfig(num_envs=n, steps=steps, chain=chain)
+    cfg = RolloutConfig(num_envs=n, steps=steps, chain=chain, patience=patience)
     noise = torch.Generator().manual_seed(seed)
     rng = np.random.default_rng(seed)
     return env, policy, Collector(env, cfg, rng, noise, keep)
@@ -131,6 +133,19 @@ def test_chained_episodes_begin_where_the_last_one_ended():
     assert rollouts.truncated.sum() == 3 * 16
     assert episodes.from_start.sum() == 16  # only the first of each simulation
     assert np.abs(rollouts.obs[11:, :, :2]).max() > 0.01  # nobody was put back
+
+
+def test_an_episode_that_comes_no_nearer_along_the_way_is_over():
+    def longest(heading):
+        env, policy, collector = make(n=2, steps=45, horizon=40, patience=10)
+        env.heading = heading
+        collector.begin(NEAR + 4)
+        return collector.collect(policy, NEAR + 4)[1].lengths.max()
+
+    left = iter(range(1000, 0, -1))
+    assert longest(None) == 40  # nobody knows a way
+    assert longest(lambda places, goals: np.ones_like(places)) == 11  # the first comes nearer
+    assert longest(lambda places, goals: np.full_like(places, next(left))) == 40
 
 
 def test_an_ant_that_fell_is_never_chained():

@@ -18,12 +18,13 @@ from torch import Tensor
 
 from goalgan_bt.agent.policy import Actor, GaussianPolicy
 from goalgan_bt.agent.settings import RolloutConfig
-from goalgan_bt.envs.goal_env import GoalEnv, Ids
+from goalgan_bt.envs.goal_env import GoalEnv, Ids, Step
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.runs import ranks
 from goalgan_bt.runs.terminal import complain
 
 Float32 = NDArray[np.float32]
+NEARER = 0.25  # success radii by which the way left must be less to be nearer to the goal
 
 
 @dataclass
@@ -121,6 +122,9 @@ class Collector:
         self._start_achieved = env.achieved_goals(env.start_state[None])
         # Every unfinished episode, action by action: successes are known only when they end.
         self._age = np.zeros(n, dtype=np.int64)  # actions since the episode began
+        # The least way left in the episode so far, metres, and the age at which that was.
+        self._least = np.full(n, np.inf)
+        self._nearest = np.zeros(n, dtype=np.int64)
         longest = math.ceil(env.horizon / env.action_repeat) if keep != "none" else 0
         self._states = np.zeros((longest + 1, n, env.state_dim), dtype=np.float32)
         self._actions = np.zeros((longest, n, env.act_dim), dtype=np.float32)
@@ -140,7 +144,12 @@ class Collector:
     def state_dict(self) -> dict[str, Tensor]:
         """The simulations of all ranks, however many, and their unfinished episodes. All ranks
         must ask."""
-        rows = self.env.state_dict() | {"age": self._age, "from_start": self._from_start}
+        rows = self.env.state_dict() | {
+            "age": self._age,
+            "from_start": self._from_start,
+            "least": self._least,
+            "nearest": self._nearest,
+        }
         for name, table, used, _ in self._so_far():
             rows[name] = table[used]
         return {name: torch.from_numpy(ranks.gather(row)) for name, row in rows.items()}
@@ -165,10 +174,13 @@ class Collector:
                 raise ValueError(f"the {name} of its simulations are of other sizes")
         if age.min() < 0 or age.max() >= longest:
             raise ValueError("its episodes are too long")
+        if ((rows["nearest"] < 0) | (rows["nearest"] > age)).any():
+            raise ValueError("its episodes came nearest to their goals when they were not there")
         if (rows["elapsed"] != age * self.env.action_repeat).any():
             raise ValueError("the clocks of its simulations do not fit their episodes")
         self.env.load_state_dict({name: rows[name][self._mine] for name in here})
         self._age[:], self._from_start[:] = age[self._mine], rows["from_start"][self._mine]
+        self._least[:], self._nearest[:] = rows["least"][self._mine], rows["nearest"][self._mine]
         before = age[: self._mine.start]  # of other ranks
         for name, table, used, more in self._so_far():
             first = (before + more).clip(max=table.shape[1]).sum()
@@ -217,6 +229,7 @@ class Collector:
                 self._actions[self._age, ids] = step.actions
                 self._states[self._age + 1, ids] = step.states
             self._age += 1
+            self._give_up(step)
             self._rewards[t], self._achieved[t] = step.rewards, step.achieved
             self._terminated[t], self._truncated[t] = step.terminated, step.truncated
 
@@ -259,12 +272,23 @@ class Collector:
         )
         return rollouts, self._episodes(ended, paths)
 
+    def _give_up(self, step: Step) -> None:
+        """Truncate those episodes that have come no nearer to their goals for too long."""
+        env, patience = self.env, self.cfg.patience
+        if not patience or env.heading is None:
+            return
+        left = np.linalg.norm(env.along(step.achieved, env.goals), axis=1)
+        nearer = left < self._least - NEARER * env.success_radius
+        self._least[nearer], self._nearest[nearer] = left[nearer], self._age[nearer]
+        stuck = (self._age - self._nearest) * env.action_repeat >= patience
+        step.truncated[stuck & ~step.terminated] = True
+
     def _reset(self, ids: Ids, goals: FloatArray) -> None:
         if len(ids) == 0:
             return
         self.env.reset(ids, goals)
         self._from_start[ids] = True
-        self._age[ids] = 0
+        self._begin_clock(ids)
         self._states[0, ids] = self._begun(ids)[0]
 
     def _begun(self, ids: Ids) -> tuple[FloatArray, FloatArray]:
@@ -279,9 +303,12 @@ class Collector:
             return
         if self._keep != "none":
             self._states[0, ids] = self._states[self._age[ids], ids]
-        self._age[ids] = 0
+        self._begin_clock(ids)
         self.env.set_goals(ids, goals)
         self._from_start[ids] = False
+
+    def _begin_clock(self, ids: Ids) -> None:
+        self._age[ids], self._least[ids], self._nearest[ids] = 0, np.inf, 0
 
     def _episodes(
         self, ended: list[tuple[np.ndarray, ...]], paths: list[tuple[int, Float32, Float32]]

@@ -54,6 +54,10 @@ class RolloutConfig:
     """Chance that an episode that ended on its feet is followed by one from where it ended, with a
     new goal, instead of one from the start (the original: 0). Only episodes from the start make
     labels."""
+    patience: Annotated[int, NOT_NEGATIVE] = 0
+    """An episode that has come no nearer to its goal along the way for so many steps is over, for
+    most that are stuck stay so until their time is up; 0 waits for that (the original). Coverage
+    always does. Without a heading no way is known, and no episode ends so."""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from goalgan_bt.agent.networks import first_weights
 from goalgan_bt.curriculum.alp_gmm import AlpGmm
 from goalgan_bt.curriculum.gan import GoalGAN
-from goalgan_bt.curriculum.goals import GoalMemory, SuccessEstimator, goals_of, intermediate
+from goalgan_bt.curriculum.goals import FAR, GoalMemory, SuccessEstimator, goals_of, intermediate
 from goalgan_bt.curriculum.settings import GanConfig, GoalsConfig, conflicts
 from goalgan_bt.envs.maze import BoolArray, FloatArray
 from goalgan_bt.runs import checkpoint
@@ -275,7 +275,7 @@ class GoalCurriculum:
 
     def see(self, places: FloatArray) -> None:
         """Take in places where the agent has been, (m, goal_dim); a diverged body is nowhere."""
-        self.visited.add(places[np.isfinite(places).all(axis=1)])
+        self.visited.add(places[(np.abs(places) < FAR).all(axis=1)])
 
     def judge(self, goals: FloatArray, success: FloatArray) -> Judged:
         """Label goals that were tried, and keep the intermediate ones for replay.

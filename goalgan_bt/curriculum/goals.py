@@ -16,7 +16,6 @@ from goalgan_bt.envs.maze import BoolArray, FloatArray
 
 FAR = 1e6  # metres, from where no goal is
 TRIES = 5000  # episodes whose failures count
-AT_ONCE = 1_000_000  # distances, so that many places visited cost time and not memory
 
 
 def intermediate(success: FloatArray, r_min: float, r_max: float) -> BoolArray:
@@ -46,18 +45,15 @@ class GoalMemory:
 
     def add(self, goals: FloatArray) -> None:
         """Keep those of the goals (n, goal_dim) that are far enough from all that is kept."""
+        if len(self):  # most are near, and looking that up at once is fast
+            goals = goals[self.distance_to(goals) > self.distance]
         for goal in goals:
             if (np.linalg.norm(self.goals - goal, axis=1) > self.distance).all():
                 self.goals = np.append(self.goals, goal[None], axis=0)
 
     def distance_to(self, goals: FloatArray) -> FloatArray:
         """From each goal (n, goal_dim) to the nearest one kept, (n,); infinite if none is."""
-        if len(self.goals) == 0:
-            return np.full(len(goals), np.inf)
-        rows = max(1, AT_ONCE // len(self.goals))
-        some = (goals[i : i + rows] for i in range(0, len(goals), rows))
-        nearest = [np.linalg.norm(g[:, None] - self.goals, axis=2).min(axis=1) for g in some]
-        return np.concatenate([*nearest, np.empty(0)])
+        return np.asarray(cKDTree(self.goals).query(goals)[0])
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """At most n different goals, (<= n, goal_dim)."""

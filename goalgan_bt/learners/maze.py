@@ -81,7 +81,7 @@ def train(cfg: MazeConfig, folder: Path | None, stop: Stop | None = None) -> Tra
 
             # Labels: goals neither hopeless nor mastered teach the generator what to propose next.
             # It learns beside the last trust-region step and what follows.
-            judged = label(learner, collector, test_env, goals, run)
+            judged = label(learner, test_env, goals, run)
             obs = improve(learner, batch, run)
 
             # Recall traces: imagine more ways of getting to those goals, and imitate them.
@@ -250,6 +250,8 @@ def practise(learner: MazeLearner, collector: Collector, goals: Goals, run: Sess
         run.background.wait("value", "backtracking")
         learner.remember(episodes)
         learner.learn_places(rollouts)
+        seen = ranks.gather(rollouts.achieved.swapaxes(0, 1))
+        learner.curriculum.see(seen.reshape(-1, seen.shape[2]))
         model = learner.forward or learner.backtracking
         run.background.start("backtracking", soundly, model, learner.fit_model)
     return Batch(rollouts, episodes)
@@ -353,9 +355,7 @@ def shaping(learner: MazeLearner, rollouts: Rollouts) -> Float32:
     return np.where(failed, 0.0, cfg.shaping * shorter).astype(np.float32)
 
 
-def label(
-    learner: MazeLearner, collector: Collector, test_env: GoalEnv, goals: Goals, run: Session
-) -> Labelled:
+def label(learner: MazeLearner, test_env: GoalEnv, goals: Goals, run: Session) -> Labelled:
     """How hard the goals are, and a lesson for the GAN from it."""
     cfg, curriculum, noise = learner.cfg.goals, learner.curriculum, learner.noise["evaluation"]
     if cfg.label_rollouts:
@@ -367,7 +367,6 @@ def label(
     else:
         success = curriculum.estimator(goals.all)
     with run.clock.measure("learning"):
-        curriculum.see(collector.achieved_goals())
         labels, lesson = curriculum.judge(goals.all, success)
         if cfg.source in ("gan", "gan_fit_all"):
             run.background.start("gan", soundly, curriculum.gan, curriculum.gan.fit, *lesson)

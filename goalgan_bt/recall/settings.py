@@ -91,7 +91,8 @@ class PlacesConfig:
     way: Literal["recalled", "straight"] = "recalled"
     """The way that is left: recalled from the moves made, or the straight line (a control)."""
     cell: Annotated[float, ABOVE_ZERO] = 0.25
-    """Distance between two places, metres."""
+    """Distance between two places, metres. Where walls meet at their corners it must be less than
+    the body is wide: else either side of them is one place, and ways lead through."""
     reach: Annotated[float, ABOVE_ZERO] = 0.6
     """Length of a move at most, metres."""
     lags: Annotated[tuple[int, ...], ABOVE_ZERO] = (1, 2, 5, 10, 20)
