@@ -1,10 +1,10 @@
 """gymnasium-robotics' own mazes, to the letter: AntMaze_UMaze-v5, PointMaze_UMaze-v3 and the like.
 
 Cells of 4 m (Ant) or 1 m (point), success within 0.45 m, steps of 0.01 s with the integrators of
-the official models (RK4, Euler), of which the Ant holds an action for five; no fall ends an episode.
-Many at once, and bit for bit what the official environment does from the same state. There episodes
-begin anywhere; here, where the policy shall learn to reach all places from one, they begin in the
-first free cell of the map as it is written.
+the official models (RK4, Euler), of which the Ant holds an action for five; no fall ends an
+episode. Many at once, and bit for bit what the official environment does from the same state. There
+episodes begin anywhere; here, where the policy shall learn to reach all places from one, they begin
+in the first free cell of the map as it is written.
 """
 
 import importlib.util

@@ -1,6 +1,6 @@
 """Goal GAN with a backtracking model: an automatic curriculum of goals for sparse rewards.
 
-A whole run, as the command `python -m goalgan_bt.train` does it (`--help` lists every setting):
+A whole run, as the command `python -m goalgan_bt.train` does it (`--help-all` lists every setting):
 
     import goalgan_bt
     trained = goalgan_bt.train("point_umaze", seed=0, total_steps=1_000_000, out="runs")

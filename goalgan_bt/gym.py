@@ -33,7 +33,8 @@ def register() -> tuple[str, ...]:
         All of them.
     """
     four_rooms = "goalgan_bt/FourRooms-v0"
-    known = {env_id(name): name for name in envs.NAMES}
+    ours = [name for name in envs.NAMES if name not in envs.OFFICIAL]  # those have ids already
+    known = {env_id(name): name for name in ours}
     for one, name in known.items():
         if one not in gymnasium.registry:
             gymnasium.register(

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from goalgan_bt.runs.errors import RunError
+from goalgan_bt.runs.errors import RunError, UsageError
 from goalgan_bt.runs.metrics_csv import Metrics
 from goalgan_bt.viz.page_process import PageProcess
 from goalgan_bt.viz.run import Run
@@ -77,14 +77,17 @@ class OpenRun:
             width: in millimetres, for print.
 
         Raises:
+            UsageError: for a number of maps or a width that make no sense.
             RunError: if matplotlib is missing (extra `plots`), or there is nothing to draw yet.
         """
         try:
             from goalgan_bt.viz import pictures
         except ImportError:
             raise RunError('plots need matplotlib: pip install "goalgan_bt[plots]"') from None
+        if not 1 <= maps <= 50 or not (width is None or 60 <= width <= 1000):
+            raise UsageError("plot draws 1 to 50 maps, and figures for print 60 to 1000 mm wide")
         with pictures.for_print(width is not None):
-            return pictures.overview([self.folder], maps, at, width)
+            return pictures.overview([self.folder], maps, tuple(np.atleast_1d(at).tolist()), width)
 
     def show(self, height: int = 640, port: int = 8080) -> Frame:
         """The page over the run, live, for a notebook on this machine. Ends with Python.

@@ -36,7 +36,7 @@ class PlotConfig:
     """Coverage maps per run, spread over training."""
     at: Annotated[tuple[int, ...], ABOVE_ZERO] = ()
     """Iterations whose maps to draw instead."""
-    width: Annotated[float | None, between(30, 1000)] = None
+    width: Annotated[float | None, between(60, 1000)] = None
     """For print: the figure's width in mm (a column of a paper has 80 to 90), with small type."""
 
 

@@ -106,7 +106,7 @@ def test_other_kinds_of_pictures_are_refused(folder, tmp_path):
     done = plot(folder, "--out", tmp_path / "figure.jpg")
     assert done.returncode == 2 and ".png or .svg or .pdf" in done.stderr
     done = plot(folder, "--width", 3)
-    assert done.returncode == 2 and "--width must be between 30 and 1000" in done.stderr
+    assert done.returncode == 2 and "--width must be between 60 and 1000" in done.stderr
 
 
 def several(folder, out, methods, seeds):
@@ -143,3 +143,42 @@ def test_few_runs_of_a_folder_have_a_line_each(folder, tmp_path):
     out = several(folder, tmp_path / "runs", ("recall_traces", "uniform"), 2)
     curves = next(ax for ax in pictures.overview(runs_in([out])).axes if ax.get_xlabel())
     assert len([line for line in curves.lines if "published" not in line.get_label()]) >= 4
+
+
+def test_a_seed_that_ended_early_does_not_cut_the_others_off(folder, tmp_path):
+    out = several(folder, tmp_path / "runs", ("recall_traces",), 7)
+    early = out / "recall_traces-s6/metrics.csv"
+    early.write_text("".join(early.read_text().splitlines(keepends=True)[:3]))
+    figure = pictures.overview(runs_in([out]), maps=2)
+    curves = next(ax for ax in figure.axes if ax.get_xlabel())
+    steps = Run(folder).metrics.column("steps/train")
+    assert curves.lines[0].get_xdata()[-1] == steps[-1]
+    assert curves.lines[0].get_ydata()[-1] == pytest.approx(0.25)  # of six seeds, 0 to 0.5
+
+
+def test_runs_without_a_report_are_left_out_and_told(folder, tmp_path, capsys):
+    out = several(folder, tmp_path / "runs", ("recall_traces", "uniform"), 1)
+    shutil.rmtree(out / "uniform-s0/frames")
+    for name in ("metrics.csv", "frames"):
+        path = shutil.copytree(folder, out / f"without-{name}") / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    done = run_module("plot", out, "--out", tmp_path / "c.png")
+    assert done.returncode == 0, done.stderr
+    done = run_module("plot", out / "without-frames", "--out", tmp_path / "d.png")
+    assert done.returncode == 2 and "no report yet" in done.stderr
+
+
+def test_more_than_six_runs_are_grouped_whatever_their_methods(folder, tmp_path):
+    out = several(folder, tmp_path / "runs", tuple("abcdefg"), 1)
+    curves = next(ax for ax in pictures.overview(runs_in([out])).axes if ax.get_xlabel())
+    assert curves.get_title() == "point_umaze" and len(curves.collections) == 7
+
+
+def test_coverage_and_return_have_a_panel_each(folder, tmp_path):
+    hopper = tmp_path / "hopper"
+    hopper.mkdir()
+    (hopper / "config.json").write_text('{"env": "hopper", "method": "trpo", "seed": 0}')
+    (hopper / "meta.json").write_text('{"commit": "x", "maze": null}')
+    (hopper / "metrics.csv").write_text("iteration,steps/train,eval/return\n1,100,5\n2,200,7\n")
+    panels = [ax for ax in pictures.overview([folder, hopper]).axes if ax.get_xlabel()]
+    assert [ax.get_ylabel() for ax in panels] == ["coverage", "return"]

@@ -245,7 +245,7 @@ def test_several_runs_stand_side_by_side(trained, folder):
         (folder / f"frames/{i:06d}.npz").unlink()  # the first is behind the second
     view = View([Run(folder), Run(trained)], port=0)
     assert node(view, "/run1").position[0] > node(view, "/run0").position[0] + 6
-    assert view.panel.slider.max == 3 and "Iteration 4" in view.panel.caption.content
+    assert view.panel.slider.max == 3 and "s0: Iteration 1 " in view.panel.caption.content
     pictures = [node(view, f"/run{i}/coverage/node").image.copy() for i in range(2)]
     assert not np.array_equal(*pictures)
     view.panel.follow.value = False

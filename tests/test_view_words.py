@@ -6,6 +6,7 @@ import re
 import shutil
 import time
 from dataclasses import asdict
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from goalgan_bt.runs.metrics_csv import Metrics
 from goalgan_bt.runs.policies import MOST, forget_after, keep_policy, kept_policies, kept_policy
 from goalgan_bt.viz import palette
 from goalgan_bt.viz.captions import covers, doing, practised
+from goalgan_bt.viz.download import as_csv
 from goalgan_bt.viz.layers import GOALS, OF_KIND, legend
 from goalgan_bt.viz.player import Player
 from goalgan_bt.viz.run import Run, visits
@@ -181,18 +183,93 @@ def test_a_click_on_one_of_several_runs_chooses_it_and_is_tried_there(trained, f
     view._ask("goal", there + np.array([0.2, 0.0]))
     now = time.monotonic()
     view.tick(now)
-    assert view._chosen == 1 and view.panel._run.value == view.runs[1].name
+    assert view._chosen == 1 and view.panel._run.value.startswith("2: ")
     view._play_body(now + 1e-3)
     (centre,) = bodies_of(view)
     assert centre == pytest.approx(there, abs=0.1)
     assert "Goal (0.2, 0.0)" in view.panel.outcome.content
     assert len(node(view, "/run1/body/goal").points) > 10
-    view._ask("choose", view.runs[0].name)
+    view._ask("choose", 0)
     view.tick(now)
     assert view._chosen == 0 and len(node(view, "/run1/body/goal").points) == 1
     view._ask("choose", "no such run")
     view.tick(now)
     assert view._chosen == 0 and not view._trouble
+    view.close()
+
+
+def test_two_runs_of_one_name_can_be_told_apart(trained, tmp_path):
+    other = shutil.copytree(trained, tmp_path / trained.name)
+    view = opened(trained, other)
+    assert len(set(view.panel._run.options)) == 2
+    view._ask("choose", 1)
+    view.tick(time.monotonic())
+    assert view._chosen == 1
+    view.close()
+
+
+def test_another_run_is_chosen_in_the_past_that_is_on_show(trained, folder):
+    view = opened(trained, folder)
+    view.panel.follow.value = False
+    view._ask("slider", 0)
+    view._ask("choose", 1)
+    view.tick(time.monotonic())
+    assert view.stage.report == view._reports[1] and view.stage.report < 4
+    assert f"Iteration {view.stage.report} " in view.panel.caption.content
+    assert view.runs[1].task_and_method() in view.panel.caption.content.replace("&#95;", "_")
+    view.close()
+
+
+def test_the_table_is_that_of_the_report_on_show(trained, folder):
+    (folder / "frames/000001.npz").unlink()
+    (folder / "frames/000002.npz").unlink()
+    sent = []
+    view = opened(trained, folder)
+    client = SimpleNamespace(send_file_download=lambda name, data: sent.append(data))
+    view._ask("choose", 1)
+    view.panel.follow.value = False
+    view._ask("slider", 2)
+    view._ask("csv", client)
+    view.tick(time.monotonic())
+    assert sent == [as_csv(read_frame(folder / f"frames/{view._reports[1]:06d}.npz"))]
+    view.close()
+
+
+def test_a_refusal_can_be_read_while_the_body_plays(folder):
+    view = opened(folder)
+    now = time.monotonic()
+    view._play_body(now)
+    view._ask("goal", np.array([0.0, 2.0]))  # a wall
+    view._serve_all(now + 0.1)
+    view._play_body(now + 0.2)
+    assert "free place" in view.panel.outcome.content
+    view._play_body(now + 10)
+    assert "Policy of iteration" in view.panel.outcome.content
+    view.close()
+
+
+def test_the_headline_knows_that_a_run_has_ended_or_gone(folder):
+    (folder / "ended.txt").unlink()
+    view = opened(folder)
+    assert "body learns" in view.panel.doing.content
+    (folder / "ended.txt").write_text("interrupted")
+    view._look()
+    assert "has learned" in view.panel.doing.content
+    shutil.rmtree(folder)
+    view._look()
+    assert "Click on" not in view.panel.doing.content
+    view.close()
+
+
+def test_runs_of_several_kinds_share_a_page(trained, rooms):
+    view = opened(trained, rooms)
+    boxes = {name: box.label for name, box in view.panel._boxes.items()}
+    assert boxes["coverage"] == "Coverage map / Visits" and boxes["goals"] == "Goals"
+    assert view.panel.caption.content.startswith(
+        view.runs[0].task_and_method().replace("_", "&#95;")
+    )
+    for plot, handle in zip(view.panel.curves._plots, view.panel.curves._handles, strict=True):
+        assert len(handle.series) == 2 + len(view.panel.curves._levels(plot))  # x, and one run
     view.close()
 
 
@@ -216,11 +293,19 @@ def test_kept_policies_are_thinned_and_the_one_before_is_found(tmp_path):
     for iteration in range(10, 10 * (MOST + 2), 10):
         keep_policy(state_of(iteration), tmp_path)
     kept = [int(path.stem) for path in kept_policies(tmp_path)]
-    assert kept == list(range(10, 10 * (MOST + 2), 20))
-    assert kept_policy(tmp_path, 49).stem == "000030" and kept_policy(tmp_path, 50).stem == "000050"
+    assert kept == [10, *range(30, 10 * (MOST + 2), 10)]  # the first and the last stay
+    assert kept_policy(tmp_path, 29).stem == "000010" and kept_policy(tmp_path, 50).stem == "000050"
     assert kept_policy(tmp_path, 3).stem == "000010" and kept_policy(tmp_path, None) is None
     forget_after(tmp_path, 50)
-    assert [int(path.stem) for path in kept_policies(tmp_path)] == [10, 30, 50]
+    assert [int(path.stem) for path in kept_policies(tmp_path)] == [10, 30, 40, 50]
+
+
+def test_kept_policies_stay_spread_over_a_long_run(tmp_path):
+    for iteration in range(1, 301):
+        keep_policy(state_of(iteration), tmp_path)
+    kept = [int(path.stem) for path in kept_policies(tmp_path)]
+    assert len(kept) == MOST and kept[0] == 1 and kept[-1] == 300
+    assert max(np.diff(kept)) <= 4 * 300 / MOST
 
 
 def test_policies_are_not_written_or_removed_through_a_link(tmp_path):
@@ -236,9 +321,8 @@ def test_policies_are_not_written_or_removed_through_a_link(tmp_path):
 def test_a_damaged_kept_policy_is_passed_over(folder):
     first, *_, last = kept_policies(folder)
     player = Player(folder)
-    assert player.take(None)
     first.write_bytes(b"nothing")
-    assert player.take(int(first.stem)) and player.iteration == 4  # the one it has
+    assert player.take(int(first.stem)) and player.iteration == 4  # that of the checkpoint
     assert player.take(int(last.stem)) and player.iteration == int(last.stem)
 
 

@@ -30,12 +30,14 @@ def state(run: Run) -> str:
     if not len(metrics):
         return "has begun; no iteration is finished yet."
     coverage, steps = measured(metrics)
-    progress = (
-        f"iteration {metrics.last('iteration'):,.0f}, "
-        f"{metrics.last('steps/train') / 1e6:.2f}M steps, "
-        f"{metrics.last('time/fps'):,.0f} steps/s"
-        + (f", coverage {coverage:.2f} at {steps / 1e6:.2f}M" if coverage == coverage else "")
+    seen, speed = metrics.last("steps/train"), metrics.last("time/fps")
+    known = (  # what a table may lack is NaN, and left out
+        (True, f"iteration {metrics.last('iteration'):,.0f}"),
+        (seen == seen, f"{seen / 1e6:.2f}M steps"),
+        (speed == speed, f"{speed:,.0f} steps/s"),
+        (coverage == coverage, f"coverage {coverage:.2f} at {steps / 1e6:.2f}M"),
     )
+    progress = ", ".join(words for there, words in known if there)
     if (ended := run.ended()) is not None:
         return f"ended ({ended}): {progress}"
     learns = time.time() - metrics.changed < SILENT
@@ -44,7 +46,7 @@ def state(run: Run) -> str:
 
 def doing(run: Run) -> str:
     """What a run is about at the moment, in a sentence or two for who has never seen one."""
-    metrics, over = run.metrics, run.ended() == "complete"
+    metrics, over = run.metrics, run.ended() is not None or run.gone
     if run.kind == "running":
         value = metrics.last("eval/return")
         told = "" if value != value else f"; its last measured return is {value:,.0f}"
@@ -57,7 +59,8 @@ def doing(run: Run) -> str:
     if over:
         covered, _ = measured(metrics)
         known = "" if covered != covered else f" It reaches **{covered:.0%}** of the {world}."
-        return f"A body has learned to go through this {world}.{known} {CLICK}"
+        click = "" if run.gone else f" {CLICK}"
+        return f"A body has learned to go through this {world}.{known}{click}"
     frame = run.frame(run.iterations[-1]) if run.iterations else None
     if frame is None or not len(frame["goals"]):
         return f"A body learns to reach every place of this {world}. It has just begun."

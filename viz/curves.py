@@ -1,5 +1,6 @@
 """The curves of the panel, drawn by uPlot in the browser."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -157,16 +158,18 @@ class Curves:
     def __init__(self, gui: viser.GuiApi, runs: list[Run]) -> None:
         self._runs = runs
         kinds = dict.fromkeys(run.kind for run in runs)
-        self._plots = [plot for kind in kinds for plot in PLOTS[kind]]
+        self._plots = list(dict.fromkeys(plot for kind in kinds for plot in PLOTS[kind]))
         self._handles: list[Any] = []
         for plot in self._plots:
             names = [name for _, name in plot.curves]
             shown = plot
             if len(runs) > 1:
                 shown = replace(plot, title=f"{plot.title}: {names[0]}")
-                names = [run.task_and_method() for run in runs]
-            lines = levels(runs[0], plot)
-            self._handles.append(_add(gui, shown, self._data(plot), names, lines))
+                names = [run.task_and_method() for run in self._runs_in(plot)]
+            shares = len(runs) == 1  # all curves of a run, or one of each run that has it
+            colours = [RUNS[i] for i, run in enumerate(runs) if plot in PLOTS[run.kind]]
+            data, lines = self._data(plot), self._levels(plot)
+            self._handles.append(_add(gui, shown, data, names, lines, RUNS if shares else colours))
 
     def refresh(self) -> None:
         """Send what is new to the page."""
@@ -174,13 +177,24 @@ class Curves:
             handle.data = self._data(plot)
 
     def _data(self, plot: Plot) -> tuple[FloatArray, ...]:
-        known = [series(run, plot) for run in self._runs]
-        x = max((steps for steps, *_ in known), key=lambda steps: steps[-1])
-        if len(known) == 1:
-            curves = known[0][1:]
+        runs = self._runs_in(plot)
+        known = [series(run, plot) for run in runs]
+        if len(self._runs) == 1:
+            x, *curves = known[0]
         else:
-            curves = tuple(np.interp(x, steps, first, right=np.nan) for steps, first, *_ in known)
-        return (x, *curves, *(np.full(len(x), y) for _, y in levels(self._runs[0], plot)))
+            x = np.unique(np.concatenate([steps for steps, *_ in known]))
+            x = x[thinned(len(x))]
+            curves = [np.interp(x, steps, first, right=np.nan) for steps, first, *_ in known]
+        return (x, *curves, *(np.full(len(x), y) for _, y in self._levels(plot)))
+
+    def _runs_in(self, plot: Plot) -> list[Run]:
+        """Those whose kind has such a plot."""
+        return [run for run in self._runs if plot in PLOTS[run.kind]]
+
+    def _levels(self, plot: Plot) -> list[tuple[str, float]]:
+        """What was published, where the runs have one task."""
+        runs = self._runs_in(plot)
+        return levels(runs[0], plot) if len({run.task for run in runs}) == 1 else []
 
 
 def _add(
@@ -189,10 +203,11 @@ def _add(
     data: tuple[FloatArray, ...],
     names: list[str],
     levels: list[tuple[str, float]],
+    colours: Sequence[str],
 ) -> viser.GuiUplotHandle:
     """A plot with the curves of those names, and published levels."""
     lines = [
-        uplot.Series(label=name, stroke=RUNS[i % len(RUNS)], width=2, spanGaps=True)
+        uplot.Series(label=name, stroke=colours[i % len(colours)], width=2, spanGaps=True)
         for i, name in enumerate(names)
     ]
     lines += [

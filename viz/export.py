@@ -44,6 +44,8 @@ def export(run: Run, path: Path) -> None:
         RunError: if the run holds no report.
         OSError: if the file cannot be written.
     """
+    if run.kind == "running":
+        raise RunError(f"{run.folder} is a run of locomotion: it has no map to export")
     if not run.iterations:
         raise RunError(f"{run.folder} holds no report yet: wait for its first one")
     server = start_server("127.0.0.1", 0)

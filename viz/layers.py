@@ -112,6 +112,19 @@ def legend(kind: str) -> str:
     return f'<div style="font-size:12px;padding:4px 12px">{bar}{words}</div>'
 
 
+def layers_of(kinds: list[str]) -> dict[str, Layer]:
+    """What runs of these kinds can show; what is called otherwise in each has all names."""
+    layers: dict[str, Layer] = {}
+    for kind in kinds:
+        for name, layer in OF_KIND[kind].items():
+            known = layers.get(name)
+            if known is not None and known != layer:
+                both = dict.fromkeys((known.label, layer.label))
+                layer = Layer(" / ".join(both), f"{known.hint} {layer.hint}", known.shown)
+            layers[name] = layer
+    return layers
+
+
 def about(kind: str) -> str:
     """What one is looking at, as markdown."""
     return "\n\n".join(f"**{layer.label}.** {layer.hint}" for layer in OF_KIND[kind].values())

@@ -40,7 +40,10 @@ GOALS = {  # by label
     0: Goal("intermediate", (255, 255, 255), (20, 20, 20), "circle", "o"),
     1: Goal("too easy", (150, 158, 172), (20, 20, 20), "square", "s"),
 }
-RUNS = ("#3b7dd8", "#e8871e", "#4aa564", "#c2416b", "#8a63c9", "#7a7a7a")  # one each, and curves
+RUNS = (  # one each, and curves
+    *("#3b7dd8", "#e8871e", "#4aa564", "#c2416b", "#8a63c9", "#7a7a7a", "#17a2b8", "#b5a400"),
+    *("#7fb2f0", "#f4b678", "#8fd19e", "#e58fac", "#c4aee8", "#b8b8b8", "#8fd9e6", "#8c5a3c"),
+)
 
 
 def colours(rate: FloatArray) -> NDArray[np.uint8]:

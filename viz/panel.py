@@ -8,16 +8,19 @@ import viser
 
 from goalgan_bt.viz.captions import settings_table
 from goalgan_bt.viz.curves import Curves
-from goalgan_bt.viz.layers import OF_KIND, about, legend
+from goalgan_bt.viz.layers import about, layers_of, legend
 from goalgan_bt.viz.run import Run
 from goalgan_bt.viz.tour import TOUR
 
-KEYS = (  # what the keyboard does: key, words, and the request with its value
+SETTINGS = "### Settings\n\n"
+# What the keyboard does: key, words, and the request with its value.
+KEYS: tuple[tuple[str, str, str, Any], ...] = (
     ("pageup", "One report back", "step", -1),
     ("pagedown", "One report on", "step", 1),
     ("home", "The first report", "step", -(10**9)),
     ("T", "Try all tiles", "all", None),
     ("G", "Let the body choose its goals", "release", None),
+    ("H", "The tour", "tour", None),
 )
 
 
@@ -39,9 +42,7 @@ class Panel:
     ) -> None:
         self._gui, self._runs, self._ask = server.gui, runs, ask
         self._kinds = list(dict.fromkeys(run.kind for run in runs))
-        self._layers = {
-            name: layer for kind in self._kinds for name, layer in OF_KIND[kind].items()
-        }
+        self._layers = layers_of(self._kinds)
         self._stop = -1  # of the tour; -1: nobody is on it
         self._theme(dark=True)
         gui = self._gui
@@ -49,9 +50,10 @@ class Panel:
         self._add_tour()
         gui.add_html("".join(legend(kind) for kind in self._kinds))
         if len(runs) > 1:
-            names = [run.name for run in runs]
-            self._run: Any = gui.add_dropdown("Run", names, hint="Whose body is on show")
-            self._run.on_update(lambda event: ask("choose", event.target.value))
+            # Numbered: two folders may have the same name.
+            self._names = [f"{i}: {run.task_and_method()}" for i, run in enumerate(runs, 1)]
+            self._run: Any = gui.add_dropdown("Run", self._names, hint="Whose body is on show")
+            self._run.on_update(self._chosen)
         self.status = gui.add_markdown("")
         # What the body is doing.
         self.outcome = gui.add_markdown("No policy yet.", visible=self._kinds != ["rooms"])
@@ -69,8 +71,9 @@ class Panel:
         self._add_keys()
 
     def choose(self, index: int) -> None:
-        """Have the list of runs say which one has the body."""
-        self._run.value = self._runs[index].name
+        """Have the panel speak of the run that has the body."""
+        self._run.value = self._names[index]
+        self._settings.content = SETTINGS + settings_table(self._runs[index].settings)
 
     def _theme(self, dark: bool) -> None:
         self._gui.configure_theme(
@@ -107,30 +110,38 @@ class Panel:
     def _add_about(self) -> None:
         gui = self._gui
         gui.add_markdown("\n\n".join(about(kind) for kind in self._kinds))
-        keys = ", ".join(f"{key.title()}: {words.lower()}" for key, words, *_ in KEYS)
-        gui.add_markdown(f"**Keys.** Space: play or stop, H: the tour, {keys}.")
+        keys = [f"{key.title()}: {words.lower()}" for key, words, *_ in self._keys()]
+        if self._reports:
+            gui.add_markdown(f"**Keys.** {', '.join(['Space: play or stop', *keys])}.")
         light: Any = gui.add_checkbox("Light page", False)
         light.on_update(lambda event: self._theme(dark=event.target.value is not True))
         if self._reports:
             table = gui.add_button("This report as CSV")
             table.on_click(lambda event: self._ask("csv", event.client))
-        page = gui.add_button("This run as one HTML page")
-        page.on_click(lambda event: self._ask("page", event.client))
-        gui.add_markdown("### Settings\n\n" + settings_table(self._runs[0].settings))
+            page = gui.add_button("This run as one HTML page")
+            page.on_click(lambda event: self._ask("page", event.client))
+        self._settings = gui.add_markdown(SETTINGS + settings_table(self._runs[0].settings))
+
+    def _keys(self) -> list[tuple[str, str, str, Any]]:
+        """Those that do something here."""
+        return [key for key in KEYS if key[2] == "step" or "goals" in self._kinds]
 
     def _add_keys(self) -> None:
         gui = self._gui
+        if not self._reports:
+            return
         gui.add_command("Play or stop", hotkey="space").on_trigger(lambda _: self._toggle_play())
-        if "goals" in self._kinds:
-            gui.add_command("The tour", hotkey="H").on_trigger(lambda _: self._next_stop())
-        for key, words, request, value in KEYS:
+        for key, words, request, value in self._keys():
             command = gui.add_command(words, hotkey=key)  # type: ignore[arg-type]
             command.on_trigger(partial(self._key_pressed, request, value))
 
     def _key_pressed(self, request: str, value: Any, _: Any) -> None:
         if request == "step":
             self._stop_following()
-        self._ask(request, value)
+        if request == "tour":
+            self._next_stop()
+        else:
+            self._ask(request, value)
 
     def _toggle_play(self) -> None:
         self.play.value = not self.play.value
@@ -166,6 +177,10 @@ class Panel:
         self._ask("tour", {name: bool(box.value) for name, box in self._boxes.items()})
 
     # What people press.
+
+    def _chosen(self, event: Any) -> None:
+        if event.client is not None and event.target.value in self._names:
+            self._ask("choose", self._names.index(event.target.value))
 
     def _layer_switched(self, name: str, event: Any) -> None:
         self._ask("layer", (name, event.target.value))

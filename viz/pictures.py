@@ -44,6 +44,10 @@ def for_print(wanted: bool = True) -> AbstractContextManager[None]:
     return rc_context(style)
 
 
+class NoReport(RunError):
+    """A run has nothing to draw yet."""
+
+
 class Measured(NamedTuple):
     """What a run was measured to be worth, in the order of time.
 
@@ -65,13 +69,15 @@ def measured(folder: Path) -> Measured:
     Raises:
         RunError: if the folder is no run, or its metrics are damaged, or there are none to draw.
     """
+    if run_folder.env_of(folder) and not (folder / "metrics.csv").exists():
+        raise NoReport(f"{folder} holds no report yet: there is nothing to draw")
     names, rows = read_metrics(folder)
     covered = "eval/coverage" in names or "eval/return" not in names
     measure = "coverage" if covered else "return"
     floor = last_of(rows, "eval/floor")
     rows = [row for row in rows if row.get(f"eval/{measure}")]
     if not rows and run_folder.maze_of(folder) is None:
-        raise RunError(f"{folder} holds no report yet: there is nothing to draw")
+        raise NoReport(f"{folder} holds no report yet: there is nothing to draw")
     try:
         columns = [[int(row[name]) for row in rows] for name in ("iteration", "steps/train")]
         values = [float(row[f"eval/{measure}"]) for row in rows]
@@ -128,12 +134,16 @@ def curves_of_methods(ax: Axes, methods: dict[str, list[Measured]]) -> None:
         known = [run for run in runs if len(run.steps)]
         if not known:
             continue
-        ends = max(run.steps[0] for run in known), min(run.steps[-1] for run in known)
+        ends = min(run.steps[0] for run in known), max(run.steps[-1] for run in known)
         grid = np.linspace(*ends, 150)
-        y = np.array([np.interp(grid, run.steps, run.values) for run in known])
-        bounds = np.array([interval(column) for column in y.T])
+        # Each seed counts where it was measured: one that ended early does not cut the others off.
+        gaps = {"left": np.nan, "right": np.nan}
+        y = np.array([np.interp(grid, run.steps, run.values, **gaps) for run in known])
+        there = [column[np.isfinite(column)] for column in y.T]
+        bounds = np.array([interval(x) if len(x) else (np.nan,) * 3 for x in there])
         name = f"{method.replace('$', '')} ({len(known)} seed{'s' * (len(known) > 1)})"
-        ax.plot(grid, bounds[:, 0], color=f"C{i % 10}", label=name)
+        dot = "o" if ends[0] == ends[1] else ""
+        ax.plot(grid, bounds[:, 0], color=f"C{i % 10}", label=name, marker=dot)
         ax.fill_between(grid, *bounds[:, 1:].T, color=f"C{i % 10}", alpha=0.15, lw=0)
     _around(ax, [run for runs in methods.values() for run in runs])
 
@@ -162,7 +172,9 @@ def _title(run: Run) -> str:
     return run.task_and_method().replace("$", r"\$")
 
 
-def coverage_map(ax: Axes, folder: Path, frame: Path, goals: float = 7.0) -> Any:
+def coverage_map(
+    ax: Axes, folder: Path, frame: Path, goals: float = 7.0, scale: float = 1.0
+) -> Any:
     """One report seen from above: tiles by success, goals by label, recall traces.
 
     Tiles show the measured coverage, or the learner's own estimate where the report has none.
@@ -172,6 +184,7 @@ def coverage_map(ax: Axes, folder: Path, frame: Path, goals: float = 7.0) -> Any
         folder: the run.
         frame: one of its frames.
         goals: the area of a goal's dot, square points; 0 leaves goals and traces away.
+        scale: of type and star.
 
     Returns:
         What `Figure.colorbar` needs.
@@ -197,12 +210,18 @@ def coverage_map(ax: Axes, folder: Path, frame: Path, goals: float = 7.0) -> Any
             x, y = arrays["goals"][labels(arrays) == label, :2].T
             dots = ax.scatter(x, y, s=goals, marker=kind.marker, label=kind.text, lw=0.4)
             dots.set(facecolor=palette.css(kind.fill), edgecolor=palette.css(kind.rim))
-    ax.plot(*maze.start, marker="*", color="white", markeredgecolor="#111111", markersize=9)
+    ax.plot(
+        *maze.start,
+        marker="*",
+        color="white",
+        markeredgecolor="#111111",
+        markersize=9 * min(1.0, scale),
+    )
     (x0, y0), (x1, y1) = drawn(maze, np.stack([maze.low, maze.high]))
     ax.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xticks=[], yticks=[])
     mean = np.mean(rate > 0 if what == "visits" else rate)
     told = f"iteration {int(frame.stem)}\n{what} {mean:.2f}"
-    ax.set_title(told, fontsize=_small(9))
+    ax.set_title(told, fontsize=min(_small(9), 9 * scale))
     return image
 
 
@@ -245,10 +264,11 @@ class Picture(Figure):
 def overview(
     folders: list[Path], maps: int = 4, at: tuple[int, ...] = (), width: float | None = None
 ) -> Figure:
-    """A row of coverage maps over training per run, and all curves below.
+    """Coverage maps over training, a row for each run, and curves below.
 
-    Where runs are many they are grouped: a panel of curves for each task, a line for each method,
-    and the maps of the first run of each method.
+    More than `FEW` runs are grouped: a panel of curves for each task, a line for each method, and
+    the maps of the first run of each method. Of several runs, those without a report are left out,
+    which is told.
 
     Args:
         folders: the runs.
@@ -257,33 +277,61 @@ def overview(
         width: of the figure in millimetres, for print; by default it is made for a screen.
 
     Raises:
-        RunError: if a folder is no run or holds no such report yet.
+        RunError: if a folder is no run, or none holds a report yet.
     """
-    runs = [measured(folder) for folder in folders]
-    tasks = by_task_and_method(runs)
-    many = len(runs) > max(FEW, sum(len(methods) for methods in tasks.values()))
+    runs = _reporting(folders)
+    tasks, many = by_task_and_method(runs), len(runs) > FEW
     shown = [of[0] for methods in tasks.values() for of in methods.values()] if many else runs
-    with_maze = [run.run for run in shown if run.run.maze is not None]
-    if at and not with_maze:
+    rows = _rows([run.run for run in shown if run.run.maze is not None], at, len(runs) > 1)
+    if at and not rows:
         raise RunError("--at chooses maps, and these runs have no maze to draw")
-    columns, panels = len(at) or maps, len(tasks) if many else 1
+    columns = min(len(at) or maps, max((len(frames) for _, frames in rows), default=1))
+    panels = len(tasks) if many or len({run.measure for run in runs}) > 1 else 1
+    beside = min(panels, 3 if width is None else 2)
     # One for a screen is as large as it needs to be; one for print has the width that is asked for.
-    across = max(2.4 * columns, 5.5 * panels) if width is None else width * MM
-    of_maps = 1.1 * across / columns * len(with_maze) + 0.35 * bool(with_maze)
-    of_curves = max(1.8, 0.55 * across / panels)
-    figure = Picture(figsize=(across, of_maps + of_curves), layout="constrained")
-    heights = [height for height in (of_maps, of_curves) if height]
+    across = max(2.4 * columns, 5.5 * beside) if width is None else width * MM
+    of_map, of_curve = 1.15 * across / columns, max(1.8, 0.6 * across / beside)
+    heights = [of_map * len(rows) + 0.35] * bool(rows) + [of_curve * math.ceil(panels / beside)]
+    figure = Picture(figsize=(across, sum(heights)), layout="constrained")
     *above, below = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False).flat
     for part in above:
-        _maps(part, with_maze, columns, at)
-    axes = below.subplots(1, panels, squeeze=False).flat
-    if many:
-        for ax, (task, methods) in zip(axes, tasks.items(), strict=True):
-            curves_of_methods(ax, methods)
-            ax.set_title(task.replace("$", r"\$"), fontsize=rcParams["font.size"])
-    else:
+        _maps(part, rows, columns, across)
+    axes = below.subplots(math.ceil(panels / beside), beside, squeeze=False).flat
+    for ax in axes[panels:]:
+        ax.set_axis_off()
+    if panels == 1 and not many:
         curve(axes[0], runs)
+        return figure
+    for ax, (task, methods) in zip(axes, tasks.items(), strict=False):
+        if many:
+            curves_of_methods(ax, methods)
+        else:
+            curve(ax, [run for of in methods.values() for run in of])
+        ax.set_title(task.replace("$", r"\$"), fontsize=rcParams["font.size"])
     return figure
+
+
+def _reporting(folders: list[Path]) -> list[Measured]:
+    """What runs were measured to be worth; of several, those with nothing to draw are left out."""
+    runs = []
+    for folder in folders:
+        try:
+            runs.append(measured(folder))
+        except NoReport as error:
+            if len(folders) == 1:
+                raise
+            complain(f"{error}: it is left out", "warning")
+    if not runs:
+        raise RunError("none of these runs holds a report yet: there is nothing to draw")
+    return runs
+
+
+def _rows(runs: list[Run], at: tuple[int, ...], several: bool) -> list[tuple[Run, list[Path]]]:
+    """Runs with the frames whose maps can be drawn; of several, those without one have none."""
+    rows = [(run, frames_at(run.folder, at) or measured_frames(run.folder)) for run in runs]
+    if not several and rows and not rows[0][1]:
+        raise RunError(f"{runs[0].folder} holds no report yet: wait for its first evaluation")
+    return [(run, frames) for run, frames in rows if frames]
 
 
 def by_task_and_method(runs: list[Measured]) -> dict[str, dict[str, list[Measured]]]:
@@ -295,24 +343,23 @@ def by_task_and_method(runs: list[Measured]) -> dict[str, dict[str, list[Measure
     return tasks
 
 
-def _maps(part: SubFigure, runs: list[Run], columns: int, at: tuple[int, ...]) -> None:
-    """Coverage maps, a row for each run."""
-    axes = part.subplots(len(runs), columns, squeeze=False)
-    size = min(7.0, 2.5 * part.figure.get_figwidth() / columns)  # of a goal's dot
-    for row, run in zip(axes, runs, strict=True):
-        frames = frames_at(run.folder, at) or measured_frames(run.folder)
-        if not frames:
-            raise RunError(f"{run.folder} holds no report yet: wait for its first evaluation")
+def _maps(part: SubFigure, rows: list[tuple[Run, list[Path]]], columns: int, across: float) -> None:
+    """Coverage maps, a row for each run, in a figure of that width in inches."""
+    axes = part.subplots(len(rows), columns, squeeze=False)
+    scale = across / columns / 2.4  # of one that is made for a screen
+    for row, (run, frames) in zip(axes, rows, strict=True):
         picks = np.unique(np.linspace(0, len(frames) - 1, columns).round().astype(int))
         for ax, pick in zip(row, picks, strict=False):
-            image = coverage_map(ax, run.folder, frames[pick], size)
+            image = coverage_map(ax, run.folder, frames[pick], min(7.0, 7.0 * scale), scale)
         for ax in row[len(picks) :]:
             ax.set_axis_off()
         row[0].set_ylabel(_title(run).replace(" ", "\n"), fontsize=_small(7))
-    rooms = {run.kind for run in runs} == {"rooms"}
-    label = "visits, logarithmic" if rooms else "success"
+    kinds = {run.kind for run, _ in rows}
+    words = {"rooms": "visits, logarithmic"}
+    label = " or ".join(sorted(words.get(kind, "success") for kind in kinds))
     part.colorbar(image, ax=axes, label=label, shrink=0.8)
-    handles, names = axes[0, 0].get_legend_handles_labels()
+    found = (ax.get_legend_handles_labels() for ax in axes[:, 0])
+    handles, names = max(found, key=lambda pair: len(pair[0]))
     if handles:
         part.legend(handles, names, loc="outside lower center", ncols=3, fontsize=_small(7))
 

@@ -83,6 +83,14 @@ class Player:
         """Load the policy of an iteration, or the last one before it that the run has kept; the
         newest if None, or where none was kept. Whether there is a policy to play."""
         kept = kept_policy(self._folder, iteration)
+        self._load(kept)
+        if self._policy is None and kept is not None:  # it is damaged: rather another than none
+            self._load(None)
+        return self._policy is not None
+
+    def _load(self, kept: Path | None) -> None:
+        """Take up a policy that was kept, or that of the checkpoint, unless it is the last one
+        that was looked at."""
         path = kept or self._folder / checkpoint.NAME
         try:
             asked = path.name, os.stat(path).st_mtime_ns
@@ -92,7 +100,6 @@ class Player:
                 self._policy, self.iteration = load_policy(self.env, cfg, self._folder, kept)
         except (OSError, RunError):
             pass  # none yet, or another version: the last one will do
-        return self._policy is not None
 
     def attempt(self, goals: FloatArray, deterministic: bool = False) -> Attempt:
         """Try each goal once from the start.

@@ -1,5 +1,6 @@
 """The body in the scene of a run: episodes over and over, or one that somebody asked for."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from goalgan_bt.viz.scene import Scene
 
 RETRY = 10.0  # seconds after which a run that cannot be played is looked at again
 PAUSE = 1.0  # seconds for which a finished attempt stands still
+LEGIBLE = 4.0  # seconds for which a refusal is told
 NEAR = 0.3  # metres within which a click means a goal
 
 
@@ -41,6 +43,7 @@ class Stage:
         self._began, self._next_try, self._ended = 0.0, 0.0, -1
         self._trail: FloatArray = np.empty((0, 2))
         self.asked, self.words = False, "No policy yet: the first one comes soon."
+        self._refused = -math.inf  # until when it is told that a wish cannot be granted
         self.report: int | None = None  # whose policy it shall be; None: the newest
 
     def play(self, now: float) -> None:
@@ -60,7 +63,8 @@ class Stage:
             self._draw_around(step)
         else:
             self._scene.roll(*self._bodies.middle)
-        self.words = self._describe(now)
+        if now > self._refused:
+            self.words = self._describe(now)
 
     def ready(self, now: float) -> bool:
         """Whether there is a policy to play; takes up the one that is due."""
@@ -77,18 +81,23 @@ class Stage:
     def ask(self, place: FloatArray | None, now: float) -> None:
         """Let the body go to a place, (2,) metres, or one body to each tile (None)."""
         if not self.ready(now):
-            self.words = "There is no policy to play: none was saved yet, or by another version."
+            self._refuse(
+                "There is no policy to play: none was saved yet, or by another version.", now
+            )
             return
         goals = self._player.env.test_goals()
         if place is not None:
             goals = np.zeros((1, self._player.env.goal_dim))
             goals[0, :2] = place
             if not self._player.env.feasible(goals)[0]:
-                self.words = "No body can be there: click on a free place."
+                self._refuse("No body can be there: click on a free place.", now)
                 return
         self.begin(goals, now)
-        self.asked = True
+        self.asked, self._refused = True, -math.inf
         self.words = self._describe(now)
+
+    def _refuse(self, why: str, now: float) -> None:
+        self.words, self._refused = why, now + LEGIBLE
 
     def release(self) -> None:
         """Let the body go for goals of its own again."""
@@ -153,8 +162,10 @@ class Stage:
         assert attempt is not None
         done = max(0.0, now - self._began)
         if self._run.kind == "running":
-            far = f"This episode: return {player.returned:,.0f} in {attempt.seconds:.0f} s"
-            return f"{far}, then it falls." if attempt.fell[0] else f"{far} and on."
+            if done < attempt.seconds:
+                return f"An episode of the newest policy, {done:.1f} s"
+            how = "until it fell" if attempt.fell[0] else "standing"
+            return f"An episode: return **{player.returned:,.0f}**, {attempt.seconds:.1f} s {how}"
         whose = f"Policy of iteration {player.iteration:,}. "
         if len(attempt.goals) == 1:
             x, y = attempt.goals[0, :2]

@@ -52,6 +52,7 @@ class View:
             for i, (run, offset) in enumerate(zip(runs, self._offsets, strict=True))
         ]
         self._drawn: list[Frame | None] = [None] * len(runs)  # the frame in each scene
+        self._reports = [0] * len(runs)  # its iteration, 0 before there is one
         self._shown: int | None = None  # index of the report on show
         self._playing_since = 0.0
         self._chosen = 0  # the run whose body is on show
@@ -129,10 +130,9 @@ class View:
             if panel.follow.value and panel.slider.value != last:
                 panel.slider.value = last
             panel.curves.refresh()
-            panel.doing.content = doing(self.runs[self._chosen])
         if panel.follow.value or self._shown is None:
             self._show(len(self._longest.iterations) - 1)
-        panel.status.content = self._describe()
+        self._tell()
 
     @property
     def _longest(self) -> Run:
@@ -150,6 +150,7 @@ class View:
         with self.server.atomic():
             for i, (other, scene) in enumerate(zip(self.runs, self._scenes, strict=True)):
                 report = run.iterations[index] if other is run else report_at(other, steps)
+                self._reports[i] = report
                 if i == self._chosen:  # the body is of this report, or of the newest policy
                     self.stage.report = None if index == last else report
                 frame = other.frame(report)
@@ -158,7 +159,10 @@ class View:
                 scene.draw(frame)
                 self._drawn[i] = frame
         self._shown = index
-        self.panel.caption.content = caption(run, run.iterations[index])
+        chosen = self.runs[self._chosen]
+        if report := self._reports[self._chosen]:
+            whose = f"{plain(chosen.task_and_method())}: " if len(self.runs) > 1 else ""
+            self.panel.caption.content = whose + caption(chosen, report)
 
     def _play_time(self, now: float) -> None:
         if not self.panel.play.value:
@@ -215,7 +219,7 @@ class View:
             for layer, shown in value.items():
                 self._show_layer(layer, shown)
         elif request == "choose":
-            self._choose([run.name for run in self.runs].index(value))
+            self._choose(int(value))
         elif request == "release":
             self.stage.release()
 
@@ -229,9 +233,11 @@ class View:
         """Let another run have the body, and the words about it."""
         if index != self._chosen:
             self.stage.close()
-            self._chosen, self.stage = index, self._stage_of(index)
-            self.panel.doing.content = doing(self.runs[index])
-            self.panel.status.content = self._describe()
+            self._chosen, self.stage = range(len(self.runs))[index], self._stage_of(index)
+            self.panel.choose(self._chosen)
+            if self._shown is not None:
+                self._show(self._shown)  # the body is that of the report on show
+            self._tell()
 
     def _try(self, place: Any, now: float) -> None:
         """Let the body try a place in the scene, (2,), or all (None)."""
@@ -239,7 +245,6 @@ class View:
             there = np.asarray(place)
             away = [np.abs(there - offset - scene.centre).max() for offset, scene in self._placed()]
             self._choose(int(np.argmin(away)))
-            self.panel.choose(self._chosen)
         if self.runs[self._chosen].kind == "goals":
             self.panel.outcome.content = "One moment ..."  # many attempts take some seconds
             offset = np.array(self._offsets[self._chosen])
@@ -260,10 +265,8 @@ class View:
             self._requests.put_nowait((request, value))
 
     def _send_csv(self, client: viser.ClientHandle) -> None:
-        run = self.runs[self._chosen]
-        if self._shown is None or self._shown >= len(run.iterations):
-            return
-        frame = run.frame(run.iterations[self._shown])
+        run, report = self.runs[self._chosen], self._reports[self._chosen]
+        frame = run.frame(report) if report else None
         if frame is not None:
             client.send_file_download("coverage.csv", as_csv(frame))
 
@@ -297,9 +300,11 @@ class View:
 
         self.server.on_client_connect(fit)
 
-    def _describe(self) -> str:
+    def _tell(self) -> None:
+        """Say what goes on in the chosen run."""
         run = self.runs[self._chosen]
-        return f"**{plain(run.name)}** {plain(state(run))}"
+        self.panel.doing.content = doing(run)
+        self.panel.status.content = f"**{plain(run.name)}** {plain(state(run))}"
 
 
 def report_at(run: Run, steps: float) -> int:

@@ -9,7 +9,7 @@ from typing import Any
 from goalgan_bt.runs.frames import NUMBER
 
 FOLDER = "policies"
-MOST = 24  # kept; when there are more, every other one goes
+MOST = 24  # kept; when there are more, the one between the two that are closest goes
 
 
 def policy_alone(state: dict[str, Any]) -> dict[str, Any]:
@@ -23,14 +23,15 @@ def keep_policy(state: dict[str, Any], folder: Path) -> None:
     from goalgan_bt.runs import checkpoint  # torch, which who only looks or removes does not need
 
     home = folder / FOLDER
-    if home.is_symlink():  # somebody else's folder must not lead what is written away
-        return
+    if home.is_symlink() or (home.exists() and not home.is_dir()):
+        return  # somebody else's folder must not lead what is written away
     home.mkdir(exist_ok=True)
     checkpoint.save(policy_alone(state), home / f"{state['run']['iteration']:06d}.pt")
     kept = kept_policies(folder)
     if len(kept) > MOST:
-        for path in kept[1::2]:
-            path.unlink()
+        at = [int(path.stem) for path in kept]
+        gaps = [after - before for before, after in zip(at, at[2:], strict=False)]
+        kept[1 + gaps.index(min(gaps))].unlink()
 
 
 def kept_policies(folder: Path) -> list[Path]:

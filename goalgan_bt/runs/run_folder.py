@@ -188,6 +188,8 @@ def settings_of(folder: Path) -> dict[str, Any]:
 def task_of(settings: Mapping[str, Any]) -> str:
     """What is learned with these settings: the environment, or its body and a map of one's own."""
     env, own_map = str(settings["env"]), settings.get("map")
+    if env == "point_nd":
+        return f"{env} in {settings.get('dim')} dimensions"
     body = env.rpartition(":")[2].split("_")[0].lower()
     return env if own_map is None else f"{body}_{Path(str(own_map)).stem}"
 
