@@ -62,6 +62,7 @@ def make(
     if mine is None and name not in NAMES:
         raise ValueError(f"unknown environment {name!r}: choose one of {', '.join(NAMES)}")
     # Only now: MuJoCo takes half a second to import, and `--help` needs the names only.
+    from goalgan_bt.envs import official
     from goalgan_bt.envs.ant_maze import AntMaze
     from goalgan_bt.envs.goal_env import PhysicsError
     from goalgan_bt.envs.mujoco_env import MazeEnv
@@ -74,10 +75,8 @@ def make(
         if physics == "warp":
             raise PhysicsError("point_nd is no MuJoCo model: warp goes with point_... and ant_...")
         return PointND(dim, num_envs, horizon or 200, action_repeat)
+    how = action_repeat, threads, physics, device
     if name in OFFICIAL:
-        from goalgan_bt.envs import official
-
-        how = action_repeat, threads, physics, device
         return official.make(name, maze, integrator, num_envs, horizon, *how)
     make_body: Any
     if mine is None:
@@ -98,10 +97,15 @@ def make(
         whole = mazes.layout(layout) if map_file is None else mazes.load(map_file)
         maze = mazes.Maze(whole.rows, cell_size)
     if horizon is None:
-        usual = HORIZON[body] if mine is None else make_body.usual_horizon
-        scale = maze.longest_way / mazes.layout("umaze").longest_way
-        horizon = max(usual, 100 * round(usual * scale / 100))
-    settings = maze, integrator, num_envs, horizon, action_repeat, threads, physics, device
+        horizon = _horizon(HORIZON[body] if mine is None else make_body.usual_horizon, maze)
+    settings = maze, integrator, num_envs, horizon, *how
     env = make_body(*settings) if mine is None else own.made(name, make_body, *settings)
     env.name = f"{body}_{layout if map_file is None else map_file.stem}"
     return env
+
+
+def _horizon(usual: int, maze: mazes.Maze) -> int:
+    """Steps of an episode: more than in the U-maze where the longest way is longer, in proportion,
+    so that a body has the same time for each metre everywhere."""
+    scale = maze.longest_way / mazes.layout("umaze").longest_way
+    return max(usual, 100 * round(usual * scale / 100))

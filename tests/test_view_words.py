@@ -404,11 +404,12 @@ def test_locomotion_has_a_page_whose_body_walks(tmp_path, method):
     view = opened(folder)
     now = time.monotonic()
     view._play_body(now)
-    assert re.search(r"return -?\d", view.panel.outcome.content)
+    assert "An episode of the newest policy" in view.panel.outcome.content
     attempt = view.stage._attempt
     assert attempt.states.shape[1:] == (1, 6) and len(attempt.states) > 5
     far = attempt.states[-1, 0, 0] - attempt.states[0, 0, 0]
     view._play_body(now + attempt.seconds + 0.5)
+    assert re.search(r"return \*\*-?\d", view.panel.outcome.content)
     assert view.stage._bodies.middle[0] == pytest.approx(attempt.states[-1, 0, 0], abs=1e-6)
     assert abs(node(view, "/run0/ground").position[0] + far % 1.0) < 1.0
     titles = [plot.title for plot in view.panel.curves._plots]

@@ -174,7 +174,9 @@ def session(
     """The run, and learner and simulations as they were where the run goes on."""
     state = None if cfg.resume is None or folder is None else load(learner, folder, collector)
     env, every = collector.env, between_measurements(cfg, collector.env)
-    if every > cfg.coverage.every and ranks.rank() == 0:
+    bounded = every > cfg.coverage.every
+    second = 2 * every if bounded else 0  # the first one comes early, and has to be made up for
+    if bounded and ranks.rank() == 0:
         say(
             f"coverage of {len(env.test_goals())} goals is measured every {every:,} training "
             f"steps, not every {cfg.coverage.every:,}: it takes up to {2 * every:,}"
@@ -184,7 +186,7 @@ def session(
         asdict(cfg),
         Limits(cfg.total_steps, cfg.iterations, cfg.minutes),
         # Not in the first iteration: its line shall tell at once that all is well.
-        Schedule(lambda steps: steps + every, 2, cfg.report_every),
+        Schedule(lambda steps: max(steps + every, second), 2, cfg.report_every),
         f"{env.name}, seed {cfg.seed}",
         state=state,
         stop=stop,

@@ -132,7 +132,7 @@ def learner_of(env: str) -> Learner:
     except envs.own.OwnEnvError as error:
         raise UsageError(str(error)) from error.__cause__
     known = names()
-    near = [name for name in known if env and env in name] or get_close_matches(env, known, 2)
+    near = [name for name in known if name.endswith(f"_{env}")] or get_close_matches(env, known, 2)
     meant = f"did you mean {' or '.join(near)}? Otherwise " if near else ""
     raise UsageError(f"unknown environment {env!r}: {meant}choose one of {', '.join(known)}")
 
