@@ -42,8 +42,7 @@ def make(
         name: one of `NAMES`, or one's own (see `goalgan_bt.envs.own`).
         num_envs: N.
         threads: simulation threads, 0 for one per core.
-        horizon: steps of an episode. If None: 200 for a point, 500 for an Ant in the U-maze, and
-            in other mazes more, in proportion to the longest way from the start.
+        horizon: steps of an episode; None: 200 (point) or 500 (Ant), more in longer mazes.
         action_repeat: steps for which each action is held.
         integrator: `implicitfast`, `rk4` or the body's `own`, for MuJoCo bodies.
         dim: dimensions of `point_nd`, 2 to 6.
@@ -94,8 +93,8 @@ def make(
             env.name = body
             return env
     if maze is None:
-        whole = mazes.layout(layout) if map_file is None else mazes.load(map_file)
-        maze = mazes.Maze(whole.rows, cell_size)
+        named = mazes.layout(layout) if map_file is None else mazes.load(map_file)
+        maze = mazes.Maze(named.rows, cell_size)
     if horizon is None:
         horizon = _horizon(HORIZON[body] if mine is None else make_body.usual_horizon, maze)
     settings = maze, integrator, num_envs, horizon, *how
