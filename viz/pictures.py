@@ -290,7 +290,7 @@ def overview(
     beside = min(panels, 3 if width is None else 2)
     # One for a screen is as large as it needs to be; one for print has the width that is asked for.
     across = max(2.4 * columns, 5.5 * beside) if width is None else width * MM
-    of_map, of_curve = 1.15 * across / columns, max(1.8, 0.6 * across / beside)
+    of_map, of_curve = 1.15 * min(across / columns, 3.0), max(1.8, 0.6 * across / beside)
     heights = [of_map * len(rows) + 0.35] * bool(rows) + [of_curve * math.ceil(panels / beside)]
     figure = Picture(figsize=(across, sum(heights)), layout="constrained")
     *above, below = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False).flat

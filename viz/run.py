@@ -98,6 +98,10 @@ class Run:
         """The longer side of what is drawn of it, metres."""
         return float(np.ptp(drawn(self.maze, self.box()), axis=0).max())
 
+    def middle(self) -> FloatArray:
+        """The middle of what is drawn of it, (2,), metres."""
+        return np.asarray(drawn(self.maze, self.box()).mean(axis=0))
+
     def task_and_method(self) -> str:
         """What tells it from other runs, where its settings say so; otherwise its name."""
         known = [self.settings.get(name) for name in ("method", "seed")]

@@ -102,6 +102,7 @@ class Scene:
         colour: str | None = None,
     ) -> None:
         self._scene, self._maze, self._prefix, self._kind = server.scene, run.maze, prefix, run.kind
+        self._ground = 40.0 if colour is None else 10.0  # metres, beside others less
         box = run.box()
         self._low, self._high = box[:, :2]
         self._first, self._last = drawn(run.maze, box)
@@ -174,8 +175,8 @@ class Scene:
             return
         self._scene.add_grid(
             whole,
-            width=40.0,
-            height=40.0,
+            width=self._ground,
+            height=self._ground,
             cell_size=GROUND,
             cell_color=WALL,
             section_color=WALL,

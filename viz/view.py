@@ -275,7 +275,11 @@ class View:
     def _offset(self, index: int) -> tuple[float, float]:
         """Where a run's maze is in the scene: in rows, as one reads."""
         row, column = divmod(index, self._columns)
-        return column * self._spread, -row * (1 + ROOM_FOR_NAME) * self._spread
+        aside = (
+            self.runs[0].middle() - self.runs[index].middle()
+        )  # mazes begin anywhere in their box
+        place = np.array([column * self._spread, -row * (1 + ROOM_FOR_NAME) * self._spread])
+        return float((place + aside)[0]), float((place + aside)[1])
 
     def _place_camera(self) -> None:
         if self.runs[0].kind == "running" and len(self.runs) == 1:
@@ -283,7 +287,7 @@ class View:
             camera.position, camera.look_at = (1.0, -4.5, 1.6), (0.6, 0.0, 0.7)
             return
         first, last = self._scenes[0], self._scenes[-1]
-        rows = -min(y for _, y in self._offsets)
+        rows = (1 + ROOM_FOR_NAME) * self._spread * ((len(self.runs) - 1) // self._columns)
         width = first.size + (self._columns - 1) * self._spread
         # A page is wide, and what is far away looks smaller.
         size = max(first.size + 0.75 * rows, width / 1.25)
