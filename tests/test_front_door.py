@@ -7,7 +7,7 @@ import sysconfig
 from pathlib import Path
 
 import pytest
-from conftest import call, run_module
+from conftest import call
 
 from goalgan_bt.__main__ import COMMANDS
 from goalgan_bt.runs.run_folder import runs_in
@@ -28,7 +28,7 @@ def test_without_a_command_it_lists_them():
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_each_command_is_the_module_of_its_name(command):
-    one, other = door(command, "--help"), run_module(command, "--help")
+    one, other = door(command, "--help"), call(command, "--help")
     assert one.returncode == other.returncode == 0
     assert one.stdout == other.stdout and f"python -m goalgan_bt.{command}" in one.stdout
 
