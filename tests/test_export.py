@@ -96,7 +96,8 @@ def test_a_run_without_a_report_or_a_maze_is_refused(folder, tmp_path):
     for flags in (["--export", "run.html"], ["--movie", "map.gif"]):
         done = call("viz", folder, flags[0], tmp_path / flags[1])
         assert done.returncode == 2 and "holds no report yet" in done.stderr
-    done = call("viz", folder, folder, "--export", tmp_path / "run.html")
+    other = shutil.copytree(folder, tmp_path / "other")
+    done = call("viz", folder, other, "--export", tmp_path / "run.html")
     assert done.returncode == 2 and "name only one" in done.stderr
 
 

@@ -66,7 +66,7 @@ def test_the_wheel_runs_from_another_directory(built, tmp_path):
     zipfile.ZipFile(wheel).extractall(target)
     done = subprocess.run(
         [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(target)!r}); "
-         "import goalgan_bt; print(goalgan_bt.__file__); sys.argv[1:] = ['--help']; "
+         "import goalgan_bt; print(goalgan_bt.__file__); sys.argv[1:] = ['--help-all']; "
          "import runpy; runpy.run_module('goalgan_bt.train', run_name='__main__')"],
         cwd=tmp_path,
         capture_output=True,

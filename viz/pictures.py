@@ -76,8 +76,8 @@ def measured(folder: Path) -> Measured:
     measure = "coverage" if covered else "return"
     floor = last_of(rows, "eval/floor")
     rows = [row for row in rows if row.get(f"eval/{measure}")]
-    if not rows and run_folder.maze_of(folder) is None:
-        raise NoReport(f"{folder} holds no report yet: there is nothing to draw")
+    if not rows:
+        raise NoReport(f"{folder} holds no report yet: wait for its first evaluation")
     try:
         columns = [[int(row[name]) for row in rows] for name in ("iteration", "steps/train")]
         values = [float(row[f"eval/{measure}"]) for row in rows]
