@@ -15,6 +15,7 @@ from goalgan_bt.viz.scene import Scene
 
 RETRY = 10.0  # seconds after which a run that cannot be played is looked at again
 PAUSE = 1.0  # seconds for which a finished attempt stands still
+AROUND = 0.2  # seconds between two pictures of the trail
 LEGIBLE = 4.0  # seconds for which a refusal is told
 NEAR = 0.3  # metres within which a click means a goal
 
@@ -43,6 +44,7 @@ class Stage:
         self._began, self._next_try, self._ended = 0.0, 0.0, -1
         self._trail: FloatArray = np.empty((0, 2))
         self.asked, self.words = False, "No policy yet: the first one comes soon."
+        self._around = -math.inf  # when what is around the body was last drawn
         self._refused = -math.inf  # until when it is told that a wish cannot be granted
         self.report: int | None = None  # whose policy it shall be; None: the newest
 
@@ -59,10 +61,14 @@ class Stage:
         step = max(0, int((now - self._began) / self._attempt.dt))
         step = min(step, len(self._attempt.states) - 1)
         self._bodies.draw(self._attempt.states[step])
+        if self._run.kind == "running":
+            self._scene.roll(*self._bodies.middle)
+        # Trail, tiles and words follow some times a second: all costs the training beside.
+        if abs(now - self._around) < AROUND and step < len(self._attempt.states) - 1:
+            return
+        self._around = now
         if self._run.kind == "goals":
             self._draw_around(step)
-        else:
-            self._scene.roll(*self._bodies.middle)
         if now > self._refused:
             self.words = self._describe(now)
 
@@ -111,7 +117,7 @@ class Stage:
             self._bodies = Bodies(self._server, self._player.model, kept)
         self._bodies.show(self._scene.visible("body"))
         self._attempt = self._player.attempt(goals)
-        self._began, self._ended = now, -1
+        self._began, self._ended, self._around = now, -1, -math.inf
         if self._run.kind != "goals":
             return
         one = len(goals) == 1  # no field leads to all of them, and no trail is one
