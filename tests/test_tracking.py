@@ -2,6 +2,7 @@
 
 import json
 import struct
+import time
 
 import pytest
 from conftest import TINY, call
@@ -51,6 +52,12 @@ def test_the_metrics_of_a_run_and_of_what_goes_on_with_it(tmp_path, monkeypatch)
     more = "--iterations", 6, "--viz", "none", "--track"  # the folder does not decide it
     assert call("train", "--resume", folder, *more).returncode == 0
     config, rows = written(folder)
+    deadline = (
+        time.monotonic() + 30
+    )  # it writes in a process of its own, which a busy machine delays
+    while len(rows) < 6 and time.monotonic() < deadline:
+        time.sleep(0.5)
+        config, rows = written(folder)
     assert config["seed"] == 0 and config["env"] == "point_umaze"
     names, table = read_metrics(folder)
     assert [row["iteration"] for row in rows] == [1, 2, 3, 4, 5, 6]

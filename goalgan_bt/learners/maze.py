@@ -554,7 +554,11 @@ def save(learner: MazeLearner, collector: Collector, run: Session) -> None:
     Raises:
         InterruptedRun: if it is not: the last checkpoint then stays.
     """
-    if broken := learner.broken():
+    broken = learner.broken()
+    if broken:  # what learns beside may pass through what is not finite, and is then undone
+        run.background.finish()
+        broken = learner.broken()
+    if broken:
         raise InterruptedRun(
             f"iteration {run.iteration}: a weight of the {broken} is not finite, so that it cannot "
             "learn any more"
