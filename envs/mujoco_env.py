@@ -11,7 +11,7 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
-from goalgan_bt.envs.arrays import Array, put
+from goalgan_bt.envs.arrays import Array, namespace, put
 from goalgan_bt.envs.goal_env import GoalEnv, Ids, PhysicsError
 from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
 
@@ -109,6 +109,17 @@ class MazeEnv(MujocoEnv):
         self.maze = maze
         self.goal_low, self.goal_high = maze.low, maze.high
         super().__init__(self.model_of(maze, integrator), *simulation)
+
+    def achieved_goals(self, states: Array) -> Array:
+        """x, y, with which the state of most bodies begins, (n, 2)."""
+        return states[:, :2]
+
+    def place(self, states: FloatArray, goals: FloatArray) -> FloatArray:
+        return np.concatenate([goals, states[:, 2:]], axis=1)
+
+    def healthy(self, states: Array) -> Array:
+        """Whether all numbers are finite, (n,): nothing else ends an episode of most bodies."""
+        return namespace(states).isfinite(states).all(axis=1)
 
     def feasible(self, goals: Array) -> Array:
         return self.maze.is_free(goals)

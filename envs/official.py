@@ -18,7 +18,7 @@ import numpy as np
 from goalgan_bt.envs.ant_maze import AntMaze
 from goalgan_bt.envs.arrays import Array, namespace, put
 from goalgan_bt.envs.goal_env import Ids
-from goalgan_bt.envs.maze import FloatArray, Maze
+from goalgan_bt.envs.maze import Maze
 from goalgan_bt.envs.mujoco_env import MazeEnv, set_integrator
 from goalgan_bt.envs.point_maze import PointMaze
 
@@ -87,6 +87,8 @@ class OfficialAnt(AntMaze):
 
     success_radius = RADIUS
     substeps = 5
+    # Those of most bodies, and not the centre of mass, and not the height that ours must keep.
+    achieved_goals, place, healthy = MazeEnv.achieved_goals, MazeEnv.place, MazeEnv.healthy
 
     @staticmethod
     def model_of(maze: Maze, integrator: str) -> mujoco.MjModel:
@@ -99,16 +101,6 @@ class OfficialAnt(AntMaze):
         self.dt = self.substeps * self.model.opt.timestep
         self.start_state = np.concatenate([self.model.qpos0, np.zeros(self.model.nv)])
         self.start_state[:2] = self.maze.start
-
-    def achieved_goals(self, states: Array) -> Array:
-        """x, y of the torso, (n, 2)."""
-        return states[:, :2]
-
-    def place(self, states: FloatArray, goals: FloatArray) -> FloatArray:
-        return np.concatenate([goals, states[:, 2:]], axis=1)
-
-    def healthy(self, states: Array) -> Array:
-        return namespace(states).isfinite(states).all(axis=1)
 
 
 class OfficialPoint(PointMaze):

@@ -67,14 +67,5 @@ class PointMaze(MazeEnv):
     def observations(self, states: Array, goals: Array, achieved: Array | None = None) -> Array:
         return observed(self, states, goals)
 
-    def achieved_goals(self, states: Array) -> Array:
-        return states[:, :2]
-
-    def place(self, states: FloatArray, goals: FloatArray) -> FloatArray:
-        return np.concatenate([goals, states[:, 2:]], axis=1)
-
-    def healthy(self, states: Array) -> Array:
-        return namespace(states).isfinite(states).all(axis=1)
-
     def valid(self, states: FloatArray) -> BoolArray:
         return self.healthy(states) & self.maze.is_free(states[:, :2])

@@ -165,12 +165,6 @@ class RobotMaze(MazeEnv):
             seen += [*states[:, :2].T, *front.T]
         return xp.asarray(xp.stack(seen, axis=1), dtype=xp.float32)
 
-    def achieved_goals(self, states: Array) -> Array:
-        return states[:, :2]
-
-    def place(self, states: FloatArray, goals: FloatArray) -> FloatArray:
-        return np.concatenate([goals, states[:, 2:]], axis=1)
-
     def healthy(self, states: Array) -> Array:
         low, high = self.healthy_z
         with np.errstate(invalid="ignore"):

@@ -58,17 +58,19 @@ def work(argv: list[str] | None) -> None:
         UsageError, RunError, OSError: saying what is wrong.
     """
     cfg = from_command_line(argv)
+    parted = threading.Event()  # the parent has ended well: stay while somebody looks
+    if cfg.with_parent:
+        threading.Thread(target=_wait_for_parent, args=(parted,), daemon=True).start()
     if cfg.export is not None or cfg.movie is not None:
-        if cfg.with_parent:
-            threading.Thread(target=_wait_for_parent, daemon=True).start()
         write(cfg)
     else:
         leave_at_once()  # a page has nothing to lose
-        serve(cfg)
+        serve(cfg, parted)
 
 
-def serve(cfg: ViewConfig) -> None:
-    """Keep a page alive until a signal ends this process.
+def serve(cfg: ViewConfig, parted: threading.Event) -> None:
+    """Keep a page alive until a signal ends this process, or until nobody looks any more once its
+    parent has `parted`.
 
     Raises:
         ValueError: if a folder is no run, or one cannot listen at that address.
@@ -80,9 +82,6 @@ def serve(cfg: ViewConfig) -> None:
 
     runs = [Run(folder) for folder in cfg.runs]
     runs.sort(key=lambda run: (run.task, str(run.settings.get("method", ""))))  # stable
-    parted = threading.Event()  # the parent has ended well: stay while somebody looks
-    if cfg.with_parent:
-        threading.Thread(target=_wait_for_parent, args=(parted,), daemon=True).start()
     os.nice(19)  # looking must not slow learning; threads take it from the one that starts them
     port = free_port(cfg.host, cfg.port)
     view = View(runs, cfg.host, port)
@@ -146,10 +145,10 @@ def from_command_line(argv: list[str] | None = None) -> ViewConfig:
     return cfg
 
 
-def _wait_for_parent(parted: threading.Event | None = None) -> None:
+def _wait_for_parent(parted: threading.Event) -> None:
     """End when standard input closes, or set the event when it says so."""
     for line in sys.stdin:
-        if parted is not None and line == UNTIL_ALONE:
+        if line == UNTIL_ALONE:
             parted.set()
     os._exit(0)
 

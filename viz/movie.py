@@ -9,7 +9,6 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 from rich.progress import track
 
-from goalgan_bt.runs import run_folder
 from goalgan_bt.runs.errors import RunError
 from goalgan_bt.runs.frames import frame_paths
 from goalgan_bt.viz import pictures, video
@@ -49,9 +48,8 @@ def _picture(folder: Path, frame: Path) -> NDArray[np.uint8]:
     if left.get_legend_handles_labels()[0]:  # goals; four rooms show none
         low = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.01)}
         left.legend(fontsize=7, ncols=3, frameon=False, **low)
-    rooms = run_folder.env_of(folder).startswith("four_rooms")
-    label = "visits, logarithmic" if rooms else "success"
-    figure.colorbar(image, ax=left, label=label, shrink=0.8)
-    pictures.curve(right, [pictures.measured(folder)], until=int(frame.stem))
+    run = pictures.measured(folder)
+    figure.colorbar(image, ax=left, label=pictures.SCALE[run.run.kind], shrink=0.8)
+    pictures.curve(right, [run], until=int(frame.stem))
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()

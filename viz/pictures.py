@@ -21,11 +21,12 @@ from goalgan_bt.runs.frames import frame_paths, read_frame
 from goalgan_bt.runs.metrics_csv import read_metrics
 from goalgan_bt.runs.terminal import complain
 from goalgan_bt.study.published import published
-from goalgan_bt.study.statistics import interval
+from goalgan_bt.study.statistics import Curve, band
 from goalgan_bt.viz import palette
-from goalgan_bt.viz.run import Run, drawn, labels, on_floor, places
+from goalgan_bt.viz.run import Run, drawn, floor_of, labels, places
 
 WALL = "#c9cdd3"
+SCALE = {"goals": "success", "rooms": "visits, logarithmic"}  # what the colours of a map tell
 PRINT = {  # for a column of a paper
     "font.size": 7,
     "axes.linewidth": 0.5,
@@ -69,9 +70,8 @@ def measured(folder: Path) -> Measured:
     Raises:
         RunError: if the folder is no run, or its metrics are damaged, or there are none to draw.
     """
-    if run_folder.env_of(folder) and not (folder / "metrics.csv").exists():
-        raise NoReport(f"{folder} holds no report yet: there is nothing to draw")
-    names, rows = read_metrics(folder)
+    begun = (folder / "metrics.csv").exists() or not run_folder.env_of(folder)
+    names, rows = read_metrics(folder) if begun else ([], [])
     covered = "eval/coverage" in names or "eval/return" not in names
     measure = "coverage" if covered else "return"
     floor = last_of(rows, "eval/floor")
@@ -131,17 +131,11 @@ def curves_of_methods(ax: Axes, methods: dict[str, list[Measured]]) -> None:
         RunError: if some have coverage and others not.
     """
     for i, (method, runs) in enumerate(methods.items()):
-        known = [run for run in runs if len(run.steps)]
-        if not known:
-            continue
-        ends = min(run.steps[0] for run in known), max(run.steps[-1] for run in known)
+        # To the last report of any: a seed that ended early does not cut the others off.
+        ends = min(run.steps[0] for run in runs), max(run.steps[-1] for run in runs)
         grid = np.linspace(*ends, 150)
-        # Each seed counts where it was measured: one that ended early does not cut the others off.
-        gaps = {"left": np.nan, "right": np.nan}
-        y = np.array([np.interp(grid, run.steps, run.values, **gaps) for run in known])
-        there = [column[np.isfinite(column)] for column in y.T]
-        bounds = np.array([interval(x) if len(x) else (np.nan,) * 3 for x in there])
-        name = f"{method.replace('$', '')} ({len(known)} seed{'s' * (len(known) > 1)})"
+        bounds = band([Curve(run.steps.astype(float), run.values) for run in runs], grid)
+        name = f"{method.replace('$', '')} ({len(runs)} seed{'s' * (len(runs) > 1)})"
         dot = "o" if ends[0] == ends[1] else ""
         ax.plot(grid, bounds[:, 0], color=f"C{i % 10}", label=name, marker=dot)
         ax.fill_between(grid, *bounds[:, 1:].T, color=f"C{i % 10}", alpha=0.15, lw=0)
@@ -196,7 +190,7 @@ def coverage_map(
     if maze is None:
         raise RunError(f"{folder} has no maze to draw: only its curve can be plotted")
     arrays = read_frame(frame)
-    rate, what = on_floor(arrays)
+    rate, what = floor_of(arrays)
     tiles = arrays["test_goals"]
     ax.set_facecolor(WALL)
     side = maze.tile_side(len(tiles))
@@ -230,7 +224,7 @@ def measured_frames(folder: Path) -> list[Path]:
     found = []
     for frame in frame_paths(folder):
         try:
-            if on_floor(read_frame(frame))[1] != "estimate":
+            if floor_of(read_frame(frame))[1] != "estimate":
                 found.append(frame)
         except RunError as error:
             complain(f"{error}: it is left out", "warning")
@@ -354,9 +348,7 @@ def _maps(part: SubFigure, rows: list[tuple[Run, list[Path]]], columns: int, acr
         for ax in row[len(picks) :]:
             ax.set_axis_off()
         row[0].set_ylabel(_title(run).replace(" ", "\n"), fontsize=_small(7))
-    kinds = {run.kind for run, _ in rows}
-    words = {"rooms": "visits, logarithmic"}
-    label = " or ".join(sorted(words.get(kind, "success") for kind in kinds))
+    label = " or ".join(sorted({SCALE[run.kind] for run, _ in rows}))
     part.colorbar(image, ax=axes, label=label, shrink=0.8)
     found = (ax.get_legend_handles_labels() for ax in axes[:, 0])
     handles, names = max(found, key=lambda pair: len(pair[0]))

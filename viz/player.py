@@ -16,7 +16,6 @@ from goalgan_bt.learners.maze_learner import load_policy
 from goalgan_bt.learners.trained_policy import settings_of, world_of
 from goalgan_bt.recall.places import unit
 from goalgan_bt.runs import checkpoint
-from goalgan_bt.runs.errors import RunError
 from goalgan_bt.runs.policies import kept_policy
 
 
@@ -98,7 +97,7 @@ class Player:
                 self._tried = asked
                 cfg = settings_of(self._folder)  # a resumed run may have others
                 self._policy, self.iteration = load_policy(self.env, cfg, self._folder, kept)
-        except (OSError, RunError):
+        except (OSError, ValueError):
             pass  # none yet, or another version: the last one will do
 
     def attempt(self, goals: FloatArray, deterministic: bool = False) -> Attempt:

@@ -128,7 +128,7 @@ def visits(frame: Frame) -> FloatArray:
     return np.asarray(logs / max(logs.max(initial=0.0), 1e-9))
 
 
-def on_floor(frame: Frame) -> tuple[FloatArray, str]:
+def floor_of(frame: Frame) -> tuple[FloatArray, str]:
     """What the floor shows per test goal, (K,) from 0 to 1, and what that is, in a word."""
     if "visits" in frame:
         return visits(frame), "visits"

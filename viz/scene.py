@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
 from goalgan_bt.viz.layers import MARK, OF_KIND, OLD_TRACE, PATH, START, TRACE, TRAIL
 from goalgan_bt.viz.palette import GOALS, RGB, colours
-from goalgan_bt.viz.run import Frame, Run, drawn, labels, of_goals, places, success, visits
+from goalgan_bt.viz.run import Frame, Run, drawn, floor_of, labels, of_goals, places
 
 REPLAYED, WALL, FLOOR = (190, 190, 190), (105, 110, 120), (45, 48, 54)
 FAR_BELOW = np.full((1, 1, 3), -100, dtype=np.float32)  # where a layer with nothing in it is
@@ -141,11 +141,10 @@ class Scene:
 
     def draw(self, frame: Frame) -> None:
         """Fill all layers from a frame; what a frame of an older version lacks stays empty."""
+        self._draw_tiles("coverage", frame["test_goals"], floor_of(frame)[0], 0.005)
         if self._kind == "rooms":
-            self._draw_tiles("coverage", frame["test_goals"], visits(frame), 0.005)
             self._draw_policy(frame)
             return
-        self._draw_tiles("coverage", frame["test_goals"], success(frame)[0], 0.005)
         self._draw_goals(frame)
         self._points("replay", places(frame, "replay", 2), REPLAYED, 0.012, 0.03)
         traces = places(frame, "traces", 3)
@@ -158,12 +157,9 @@ class Scene:
 
     def mark(self, goals: FloatArray, radius: float) -> None:
         """Draw a ring of that radius around a goal, (1, goal_dim); none around many."""
-        angle = np.linspace(0, 2 * np.pi, 49)
-        circle = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        few = goals[:1, None, :2] if len(goals) == 1 else np.empty((0, 1, 2))
-        points, _ = segments(np.swapaxes(few + circle, 0, 1))
-        self._lines("body", points, MARK, 3.0, "goal")
-        self._points("body", goals[: len(few)], MARK, 0.1, 0.1, "pin")
+        one = goals if len(goals) == 1 else goals[:0]
+        self._ring("body", one, radius)
+        self._points("body", one, MARK, 0.1, 0.1, "pin")
 
     def roll(self, x: float, y: float) -> None:
         """Draw the ground under a body that is kept in the middle and is at a place, metres."""
@@ -293,10 +289,14 @@ class Scene:
         fits = policy.shape == cells.shape
         lines = arrows(cells, policy * 2) if fits else np.empty((0, 2, 3), dtype=np.float32)
         self._lines("policy", lines, MARK, 1.5)
-        angle = np.linspace(0, 2 * np.pi, 33)
-        ring = 0.4 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        points, _ = segments(np.swapaxes(frame["goals"][:1, None, :2] + ring, 0, 1))
-        self._lines("policy", points, MARK, 3.0, "goal")
+        self._ring("policy", frame["goals"][:1], 0.4)
+
+    def _ring(self, layer: str, goals: FloatArray, radius: float) -> None:
+        """A circle around each of some goals, (n, goal_dim)."""
+        angle = np.linspace(0, 2 * np.pi, 49)
+        circle = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        points, _ = segments(np.swapaxes(goals[:, None, :2] + circle, 0, 1))
+        self._lines(layer, points, MARK, 3.0, "goal")
 
     def _draw_goals(self, frame: Frame) -> None:
         goals, kinds = frame["goals"], labels(frame)

@@ -1,6 +1,7 @@
 """The body in the scene of a run: episodes over and over, or one that somebody asked for."""
 
 import math
+import time
 from typing import Any
 
 import numpy as np
@@ -116,16 +117,19 @@ class Stage:
             kept = None if self._run.kind == "running" else self._offset
             self._bodies = Bodies(self._server, self._player.model, kept)
         self._bodies.show(self._scene.visible("body"))
+        began = time.monotonic()
         self._attempt = self._player.attempt(goals)
-        self._began, self._ended, self._around = now, -1, -math.inf
+        # Many take some seconds to be computed: what is shown begins after that.
+        self._began = now + time.monotonic() - began
+        tried, self._ended, self._around = self._ended >= 0, -1, -math.inf
         if self._run.kind != "goals":
             return
         one = len(goals) == 1  # no field leads to all of them, and no trail is one
         self._trail = self._player.trail(self._attempt) if one else np.empty((0, 2))
         self._scene.mark(goals, self._player.env.success_radius)
         self._scene.draw_ways(*self._player.ways(goals) if one else (goals[:0], goals[:0]))
-        nobody = np.zeros(len(goals), dtype=bool)
-        self._scene.draw_tried(goals, nobody, nobody)
+        if tried:
+            self._clear_tried()
 
     def show_body(self, visible: bool) -> None:
         """Show or hide the body."""
@@ -140,7 +144,10 @@ class Stage:
         self._scene.mark(none, 0.0)
         self._scene.draw_ways(none, none)
         self._scene.draw_trail(none)
-        self._scene.draw_tried(none, np.empty(0, bool), np.empty(0, bool))
+        self._clear_tried()
+
+    def _clear_tried(self) -> None:
+        self._scene.draw_tried(np.empty((0, 2)), np.empty(0, bool), np.empty(0, bool))
 
     def _make_player(self) -> Any:
         if self._run.kind == "running":

@@ -97,16 +97,11 @@ class MazeConfig(RunConfig):
 
 
 # What a resumed run may change: another world or other randomness would be another run.
-FIXED = {"env", "method", "seed", "map", "cell_size", "dim", "horizon", "action_repeat"}
-MAY_CHANGE = (
-    frozenset(field.name for field in fields(MazeConfig))
-    - FIXED
-    - {
-        "integrator",
-        "physics",
-        "out",
-    }
-)
+FIXED = {
+    *("env", "method", "seed", "map", "cell_size", "dim", "horizon", "action_repeat"),
+    *("integrator", "physics", "out"),
+}
+MAY_CHANGE = frozenset(field.name for field in fields(MazeConfig)) - FIXED
 
 ANT = MazeConfig(
     env="ant_umaze",

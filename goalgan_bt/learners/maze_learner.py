@@ -21,7 +21,6 @@ from goalgan_bt.recall.imitation import Imitation
 from goalgan_bt.recall.places import Places
 from goalgan_bt.recall.transitions import Transitions
 from goalgan_bt.runs import checkpoint, ranks
-from goalgan_bt.runs.errors import RunError
 from goalgan_bt.runs.session import checked
 from goalgan_bt.runs.sound import finite
 
@@ -217,17 +216,17 @@ def load_policy(
         The policy, and the iteration that made it.
 
     Raises:
-        RunError: as `load`; the environment is left as it was.
+        RunError: as `load`; of a kept one OSError or ValueError. The environment is left as it was.
     """
     places, before = places_of(env, cfg), env.heading
     env.heading = places.heading if cfg.places.heading else None  # the policy's size is with it
     try:
         policy = GaussianPolicy(env.obs_dim, env.act_dim, cfg.policy)
-        with checkpoint.saved(folder, kept) as state:
+        with checkpoint.saved(folder) if kept is None else checkpoint.loaded(kept) as state:
             places.load_state_dict(state["learner"]["places"])
             policy.load_state_dict(state["learner"]["policy"])
             iteration = int(state["run"]["iteration"])
-    except RunError:
+    except (OSError, ValueError):
         env.heading = before
         raise
     return policy, iteration

@@ -19,20 +19,9 @@ from goalgan_bt.runs.tracking import require_wandb
 DEFAULT = "ant_umaze"
 # What people set: `--help` explains these, of those that a learner has.
 OFTEN = (
-    *(
-        "env",
-        "method",
-        "seed",
-        "total_steps",
-        "minutes",
-        "iterations",
-        "map",
-        "cell_size",
-        "dim",
-        "horizon",
-    ),
-    *("num_envs", "threads", "physics", "report_every", "out", "resume"),
-    *("viz", "viz_port", "track"),
+    *("env", "method", "seed", "total_steps", "minutes", "iterations"),
+    *("map", "cell_size", "dim", "horizon", "num_envs", "threads", "physics"),
+    *("report_every", "out", "resume", "viz", "viz_port", "track"),
 )
 
 

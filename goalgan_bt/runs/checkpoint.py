@@ -205,19 +205,19 @@ OTHER = "it is damaged or of other settings or another version"
 
 
 @contextmanager
-def saved(folder: Path, kept: Path | None = None) -> Iterator[dict[str, Any]]:
+def saved(folder: Path) -> Iterator[dict[str, Any]]:
     """A run's checkpoint, while it is taken over; the one before where the last is damaged, which
-    is then told. Or another file of the run in its place.
+    is then told.
 
     Raises:
         RunError: for whatever goes wrong while it is read and taken over.
     """
-    path, previous = kept or folder / NAME, folder / PREVIOUS
+    path, previous = folder / NAME, folder / PREVIOUS
     try:
         state = read(path)
     except (OSError, ValueError) as error:
         missing = not os.path.lexists(path)
-        if not previous.is_file() or kept is not None:
+        if not previous.is_file():
             if missing:
                 raise RunError(
                     f"{folder} has no checkpoint.pt to resume from: start a new run"

@@ -15,7 +15,17 @@ from goalgan_bt.runs.metrics_csv import write_table
 from goalgan_bt.runs.run_folder import task_of
 from goalgan_bt.study.plan import Study, Trial, grid, settings
 from goalgan_bt.study.published import Published, published
-from goalgan_bt.study.statistics import Curve, areas, ends, interval, iqm, paired, ratio, time_to
+from goalgan_bt.study.statistics import (
+    Curve,
+    areas,
+    band,
+    ends,
+    interval,
+    iqm,
+    paired,
+    ratio,
+    time_to,
+)
 from goalgan_bt.study.tables import Tables
 
 THRESHOLDS = (0.3, 0.48, 0.63, 0.9)  # coverage; 0.48 and 0.63 are Goyal et al. 2019's
@@ -235,8 +245,7 @@ def _curves(
         if measured < last / 100:  # grid worlds: most of it happens at once, and is measured then
             grid = np.geomspace(measured, last, 150)
             ax.set_xscale("log")
-        y = np.array([np.interp(grid, *curve) for curve in seeds.values()])
-        bounds = np.array([interval(column) for column in y.T])
+        bounds = band(list(seeds.values()), grid)
         style = _style(i)
         ax.plot(grid / 1e6, bounds[:, 0], label=f"{method} ({len(seeds)})", **style)
         if len(of) <= 10:  # more would hide the lines; the table has the intervals

@@ -53,6 +53,15 @@ def interval(x: FloatArray) -> Interval:
     return Interval(float(iqm(x)), float(low), float(high))
 
 
+def band(curves: list[Curve], grid: FloatArray) -> FloatArray:
+    """Interquartile mean over runs and its interval at each step of a grid, (n, 3), from the lines
+    between reports. A run counts from its first report to its last; NaN where none is there."""
+    gaps = {"left": np.nan, "right": np.nan}
+    y = np.array([np.interp(grid, *curve, **gaps) for curve in curves])
+    there = [column[np.isfinite(column)] for column in y.T]
+    return np.array([interval(x) if len(x) else (np.nan,) * 3 for x in there])
+
+
 def time_to(curve: Curve, threshold: float) -> float:
     """Steps at which the line through the reports first reaches a coverage; infinite if never."""
     above = np.flatnonzero(curve.values >= threshold)
