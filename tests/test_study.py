@@ -474,3 +474,16 @@ def test_a_study_of_a_map_of_ones_own_is_titled_by_it(tmp_path):
 def tiny_file(folder):
     (folder / "tiny.toml").write_text(TINY)
     return folder / "tiny.toml"
+
+
+def test_a_band_by_hand():
+    """Each run counts from its first report to its last."""
+    curves = [
+        Curve(np.array([0.0, 10.0]), np.array([0.0, 1.0])),
+        Curve(np.array([0.0, 5.0]), np.array([0.2, 0.4])),
+    ]
+    found = statistics.band(curves, np.array([-1.0, 0.0, 5.0, 10.0]))
+    assert np.isnan(found[0]).all()
+    assert found[1:3, 0] == pytest.approx([0.1, 0.45])
+    assert found[1, 1] == pytest.approx(0.0) and found[1, 2] == pytest.approx(0.2)
+    assert found[3, 0] == 1.0 and np.isnan(found[3, 1:]).all()  # one run has no interval

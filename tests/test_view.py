@@ -450,6 +450,23 @@ def test_how_an_attempt_ended_is_told_however_late(view):
     assert "Goal (0.2, 0.0): **reached** after" in view.panel.outcome.content
 
 
+def test_what_takes_seconds_to_compute_is_shown_from_its_beginning(view, monkeypatch):
+    assert view.stage.ready(time.monotonic())
+    player = view.stage._player
+    attempt = player.attempt
+
+    def slow(goals):
+        time.sleep(0.5)
+        return attempt(goals)
+
+    monkeypatch.setattr(player, "attempt", slow)
+    view._ask("goal", np.array([0.2, 0.0]))
+    now = time.monotonic()
+    view.tick(now)
+    assert "on its way, 0.0 s" in view.panel.outcome.content
+    assert view.stage._began - now >= 0.5
+
+
 def test_a_click_into_a_wall_is_answered(view):
     view._ask("goal", np.array([0.0, 2.0]))
     view.tick(time.monotonic())

@@ -393,6 +393,28 @@ def test_four_rooms_have_a_page_a_plot_and_an_export(rooms, tmp_path):
 # Locomotion.
 
 
+def test_the_policy_of_locomotion_is_there_while_it_learns(tmp_path):
+    """So that the page needs no checkpoint, which holds all that SAC has seen."""
+    pytest.importorskip("sb3_contrib")
+    from goalgan_bt.viz.walker import Walker
+
+    words = ["--env", "hopper", "--method", "sac", "--viz", "none", "--total-steps", "250"]
+    cfg = table.from_command_line([*words, "--episodes", "1", "--out", str(tmp_path)])
+    folder = run_folder.new_run(tmp_path, "hopper", 0, asdict(cfg))
+    asked = []
+
+    class Early:  # stops after the second measurement
+        @property
+        def requested(self):
+            asked.append((folder / "policy.pt").exists())
+            return len(Run(folder).metrics) >= 2
+
+    locomotion.train(cfg, folder, Early())
+    assert asked[0] is False and asked[-1] is True and (folder / "checkpoint.pt").exists()
+    (folder / "checkpoint.pt").unlink()
+    assert Walker(folder).take(None)
+
+
 @pytest.mark.parametrize("method", ["trpo", "sac"])
 def test_locomotion_has_a_page_whose_body_walks(tmp_path, method):
     pytest.importorskip("sb3_contrib")

@@ -24,7 +24,7 @@ class Walker:
         folder: the run folder.
 
     Attributes:
-        iteration: of the policy, 0 where the run does not tell.
+        returned: the return of the last episode.
 
     Raises:
         RunError: if the run's settings cannot be read, or the extra `sb3` is missing.
@@ -38,9 +38,8 @@ class Walker:
             raise RunError(str(error)) from None
         self._env: Any = env.unwrapped.envs[0]  # by itself, without normalising
         self._moments: tuple[FloatArray, FloatArray] | None = None
-        self._tried: tuple[str, int] | None = None
-        self._ready, self._episodes, self.iteration = False, 0, 0
-        self.returned = 0.0
+        self._tried: int | None = None  # the file last looked at, by its time
+        self._ready, self._episodes, self.returned = False, 0, 0.0
 
     @property
     def model(self) -> mujoco.MjModel:
@@ -52,13 +51,16 @@ class Walker:
         """Load the newest policy if it is new; whether there is one to play. Older ones are not
         kept."""
         path = self._folder / "policy.pt"
-        path = path if path.exists() else self._folder / checkpoint.NAME
         try:
-            asked = path.name, os.stat(path).st_mtime_ns
-            if asked != self._tried:
-                self._tried = asked
-                self._load(checkpoint.read(path))
-        except (OSError, ValueError, KeyError, RuntimeError, TypeError):
+            stamp = os.stat(path).st_mtime_ns
+            if stamp != self._tried:
+                self._tried = stamp
+                with checkpoint.loaded(path) as saved:
+                    self._agent.policy.load_state_dict(saved["policy"])
+                    if "mean" in saved:
+                        self._moments = saved["mean"].numpy(), saved["var"].numpy()
+                self._ready = True
+        except (OSError, ValueError):
             pass  # none yet, or another version: the last one will do
         return self._ready
 
@@ -79,17 +81,6 @@ class Walker:
     def some_goal(self) -> FloatArray:
         """There are no goals."""
         return np.empty((1, 0))
-
-    def _load(self, state: dict[str, Any]) -> None:
-        if "parameters" in state:  # a checkpoint
-            policy, moments = state["parameters"]["policy"], state.get("observations")
-            self.iteration = int(state["run"]["iteration"])
-        else:
-            policy, moments = state["policy"], state if "mean" in state else None
-        self._agent.policy.load_state_dict(policy)
-        if moments is not None:
-            self._moments = moments["mean"].numpy(), moments["var"].numpy()
-        self._ready = True
 
     def _seen(self, observation: FloatArray) -> FloatArray:
         """What the policy sees: normalised, where it has learned so."""

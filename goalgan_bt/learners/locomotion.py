@@ -169,9 +169,9 @@ def prepared(cfg: LocomotionConfig) -> Iterator[World]:
 
 
 def train(cfg: LocomotionConfig, folder: Path | None, stop: Stop | None = None) -> Trained:
-    """Learn to run; writes `metrics.csv` into the run folder, `checkpoint.pt` with every
-    measurement, and at the end in its place `policy.pt` (the policy's state_dict, with TRPO also
-    mean and variance that its observations are normalised by).
+    """Learn to run; writes `metrics.csv` into the run folder, and with every measurement
+    `policy.pt` (the policy's state_dict, with TRPO also mean and variance that its observations are
+    normalised by) and `checkpoint.pt`, which goes at the end.
 
     Args:
         cfg: settings; goes on from the folder's checkpoint if they say so.
@@ -225,8 +225,8 @@ def train(cfg: LocomotionConfig, folder: Path | None, stop: Stop | None = None) 
             learned = {"return": float(mean)} | state_dict(agent, recall)
             run.report({})
             run.save(learned)
-        if run.complete and folder is not None:
-            save_policy(agent, folder)
+            if folder is not None:
+                save_policy(agent, folder)
     if run.complete and folder is not None:
         (folder / "checkpoint.pt").unlink(missing_ok=True)  # it holds all that SAC has seen
     return Trained(folder, "return", mean, run.steps["train"])
@@ -245,7 +245,7 @@ def measure(agent: Any, test_env: Any, cfg: LocomotionConfig) -> tuple[float, in
 
 
 def save_policy(agent: Any, folder: Path) -> None:
-    """Write the policy of a run that is complete, and what normalises its observations."""
+    """Write the policy of a run, and what normalises its observations: without SAC's replay."""
     import torch
 
     from goalgan_bt.runs import checkpoint

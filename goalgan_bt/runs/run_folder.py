@@ -7,7 +7,7 @@ runs/<env>-<time>-s<seed>/    (<env>-<method>-<time>-s<seed> where the method is
     frames/000010.npz a report: goals, labels, replay, traces, coverage (see `RunWriter.frame`)
     policies/000010.pt  policies of some measurements (see `goalgan_bt.runs.policies`)
     checkpoint.pt     the whole training state (see `goalgan_bt.runs.checkpoint`)
-    policy.pt         of locomotion, in the checkpoint's place when it is finished
+    policy.pt         of locomotion; the checkpoint goes when it is finished
     ended.txt         how the run ended; absent while it goes on, or where it was killed
     lock              held by the process that trains
     events.*          TensorBoard, if it is installed (extra `tensorboard`)
