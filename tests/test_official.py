@@ -1,9 +1,11 @@
 """gymnasium-robotics' mazes: ours are theirs, bit for bit."""
 
+import json
 import warnings
 
 import numpy as np
 import pytest
+from conftest import call
 
 from goalgan_bt import envs
 
@@ -64,3 +66,18 @@ def test_horizons_cells_and_places_are_the_official_ones(name):
     inner = env.unwrapped
     assert ours.dt == pytest.approx((inner.ant_env if "ant" in name else inner.point_env).dt)
     env.close()
+
+
+@pytest.mark.parametrize("name", ["point_umaze_gym", "ant_umaze_gym"])
+def test_a_policy_is_tried_in_the_unmodified_environment(name, tmp_path):
+    words = "--env", name, "--iterations", 1, "--viz", "none", "--threads", 1, "--out", tmp_path
+    small = "--rollout.num-envs", 4, "--rollout.steps", 4, "--horizon", 5, "--updates", 1
+    done = call("train", *words, *small, "--coverage.rollouts", 1, "--gan.pretrain-steps", 2)
+    assert done.returncode == 0, done.stderr
+    (folder,) = tmp_path.iterdir()
+    out = tmp_path / "found.json"
+    done = call("evaluate", folder, "--on", IDS[name], "--episodes", 2, "--json", out)
+    assert done.returncode == 0 and done.stderr == "", done.stderr
+    found = json.loads(out.read_text())
+    assert found["world"] == IDS[name] and found["episodes"] == 2
+    assert found["return"] == pytest.approx(found["success"])  # 1 on coming there, then it ends

@@ -1,5 +1,7 @@
 """How well a trained policy does, in its own world or in an environment of Gymnasium's."""
 
+import contextlib
+import io
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -88,11 +90,12 @@ def elsewhere(
 
     import goalgan_bt.gym  # noqa: F401  (its ids)
 
+    policy = TrainedPolicy(folder, seed)
     if name.startswith(("AntMaze", "PointMaze")):
-        import gymnasium_robotics
+        with contextlib.redirect_stderr(io.StringIO()):  # a notice about other environments
+            import gymnasium_robotics
 
         gymnasium.register_envs(gymnasium_robotics)
-    policy = TrainedPolicy(folder, seed)
     try:
         env: Any = gymnasium.make(name)
     except Exception as error:  # each package has its own
