@@ -21,7 +21,7 @@ from goalgan_bt.learners.maze_config import make_env
 from goalgan_bt.learners.maze_learner import MazeLearner
 from goalgan_bt.recall.backtracking import BacktrackingModel
 from goalgan_bt.runs import checkpoint
-from goalgan_bt.runs.errors import InterruptedRun
+from goalgan_bt.runs.errors import InterruptedRun, RunError
 from goalgan_bt.runs.sound import finite, soundly
 
 
@@ -220,7 +220,7 @@ def test_a_folder_that_is_deleted_while_it_runs_is_one_line(tmp_path, monkeypatc
         return real(learner, env, traces, batch, obs, run)
 
     monkeypatch.setattr(maze, "imitate", planted)
-    with pytest.raises(maze_learner.RunError, match="has vanished"):
+    with pytest.raises(RunError, match="has vanished"):
         maze.train(cfg, folder)
 
 
