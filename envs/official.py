@@ -18,7 +18,7 @@ import numpy as np
 from goalgan_bt.envs.ant_maze import AntMaze
 from goalgan_bt.envs.arrays import Array, namespace, put
 from goalgan_bt.envs.goal_env import Ids
-from goalgan_bt.envs.maze import Maze
+from goalgan_bt.envs.maze import FloatArray, Maze
 from goalgan_bt.envs.mujoco_env import MazeEnv, set_integrator
 from goalgan_bt.envs.point_maze import PointMaze
 
@@ -101,6 +101,9 @@ class OfficialAnt(AntMaze):
         self.dt = self.substeps * self.model.opt.timestep
         self.start_state = np.concatenate([self.model.qpos0, np.zeros(self.model.nv)])
         self.start_state[:2] = self.maze.start
+
+    def test_goals(self) -> FloatArray:
+        return self.maze.tiles(self.maze.cell_size / 4)  # 16 of a cell, as where cells are smaller
 
 
 class OfficialPoint(PointMaze):

@@ -61,6 +61,7 @@ def test_horizons_cells_and_places_are_the_official_ones(name):
     free = {tuple(np.round(place, 9)) for place in official.unique_goal_locations}
     assert {tuple(np.round(place, 9)) for place in ours.maze.cell_centres()} == free
     assert ours.feasible(np.array(official.unique_goal_locations)).all()
+    assert len(ours.test_goals()) == len(free) * (16 if "ant" in name else 4)
     start = ours.achieved_goals(ours.start_state[None])[0]
     assert tuple(np.round(start, 9)) in free
     inner = env.unwrapped
