@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import tyro
 
 from goalgan_bt.runs.command_line import check_ranges, check_target, parse, run_command
+from goalgan_bt.runs.errors import UsageError
 from goalgan_bt.runs.files import write_json
 from goalgan_bt.runs.ranges import NOT_NEGATIVE, between
 from goalgan_bt.runs.terminal import say
@@ -33,6 +34,8 @@ class EvaluateConfig:
     on: str | None = None
     """Act in this environment of Gymnasium's instead, such as goalgan_bt/AntUMaze-v0: one with
     goals whose body is the run's. Success is what its info says."""
+    horizon: Annotated[int | None, between(1, 10**6)] = None
+    """Steps of an episode; by default as many as in the run. Not with --on, which has its own."""
     seed: Annotated[int, NOT_NEGATIVE] = 0
     """Seed of the noise, and of the episodes with --on."""
     threads: Annotated[int, between(0, 1000)] = 0
@@ -54,12 +57,16 @@ def work(argv: list[str] | None) -> None:
     """
     cfg = parse(EvaluateConfig, argv, "python -m goalgan_bt.evaluate")
     check_ranges(cfg)
+    if cfg.on is not None and cfg.horizon is not None:
+        raise UsageError("--horizon: an environment given with --on has its own")
     if cfg.json is not None:
         check_target(cfg.json, (".json",))
     from goalgan_bt.learners import evaluation  # torch takes seconds
 
     if cfg.on is None:
-        found = evaluation.at_home(cfg.run, cfg.episodes, cfg.deterministic, cfg.seed, cfg.threads)
+        found = evaluation.at_home(
+            cfg.run, cfg.episodes, cfg.deterministic, cfg.seed, cfg.threads, cfg.horizon
+        )
     else:
         found = evaluation.elsewhere(cfg.run, cfg.on, cfg.episodes, cfg.deterministic, cfg.seed)
     say(sentence(found))
@@ -81,7 +88,8 @@ def sentence(found: dict[str, Any]) -> str:
             f"goals reached after {times['median']:.1f} s (median), "
             f"{times['nine_of_ten']:.1f} s (nine of ten); "
         )
-    return said + f"{found['fell']:.1%} fell, {found['out_of_time']:.1%} ran out of time"
+    said += f"{found['fell']:.1%} fell, {found['out_of_time']:.1%} ran out of time"
+    return said + (f"; return {found['return']:.3f}" if "return" in found else "")
 
 
 if __name__ == "__main__":

@@ -33,6 +33,13 @@ def test_episodes_are_counted_and_told_in_a_sentence_and_a_file(folder, tmp_path
     assert other.stdout != again.stdout
 
 
+def test_shorter_episodes_are_the_same_ones_cut_off(folder):
+    whole, cut = (evaluation.at_home(folder, 112, True, 0, 1, horizon) for horizon in (None, 40))
+    assert cut["success"] < whole["success"]
+    assert cut["seconds_to_goal"]["nine_of_ten"] <= 40 * 0.02
+    assert evaluation.at_home(folder, 112, True, 0, 1, 200) == whole  # that of the run
+
+
 def test_at_home_is_what_coverage_measures(folder):
     found = evaluation.at_home(folder, None, True, 0, 1)
     policy = TrainedPolicy(folder)
@@ -92,6 +99,8 @@ def test_the_seconds_of_a_step_are_those_of_the_environment(folder):
         (["--on", "CartPole-v1"], "it must tell goals and the 4 numbers of the body's state"),
         (["--on", "goalgan_bt/AntUMaze-v0"], "the 4 numbers of the body's state"),
         (["--json", "/nowhere/x.json"], "cannot write '/nowhere/x.json'"),
+        (["--horizon", "50"], "--horizon must be a multiple of the run's 4 steps"),
+        (["--on", "PointMaze_UMaze-v3", "--horizon", "40"], "--horizon: an environment given with"),
     ],
 )
 def test_bad_words_end_in_one_line(folder, words, problem):

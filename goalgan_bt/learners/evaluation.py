@@ -31,7 +31,12 @@ class Attempted(NamedTuple):
 
 
 def at_home(
-    folder: Path, episodes: int | None, deterministic: bool, seed: int, threads: int
+    folder: Path,
+    episodes: int | None,
+    deterministic: bool,
+    seed: int,
+    threads: int,
+    horizon: int | None = None,
 ) -> dict[str, Any]:
     """Try the test goals of the run's own world, as coverage is measured, and tell what came of it.
 
@@ -42,18 +47,22 @@ def at_home(
         deterministic: without the noise of exploration.
         seed: of that noise.
         threads: simulation threads, 0 for one per core.
+        horizon: steps of an episode; as many as in the run if None.
 
     Raises:
         RunError: if the folder is no run of a maze, or has no checkpoint that can be read.
+        UsageError: for a horizon that is no whole number of actions.
     """
     cfg, one = world_of(folder, 1)
+    if horizon is not None and horizon % cfg.action_repeat:
+        raise UsageError(f"--horizon must be a multiple of the run's {cfg.action_repeat} steps")
     tested = one.test_goals()
     n = PER_GOAL * len(tested) if episodes is None else episodes
     if deterministic:
         n = min(n, len(tested))
     most = SIDE_BY_SIDE if one.settable else cfg.rollout.num_envs
     side_by_side = min(n, most)
-    _, env = world_of(folder, side_by_side, threads)
+    _, env = world_of(folder, side_by_side, threads, horizon)
     policy, iteration = load_policy(env, cfg, folder)
     goals = tested[spread(n, len(tested))]
     noise = None if deterministic else torch.Generator().manual_seed(seed)

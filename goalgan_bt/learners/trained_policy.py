@@ -32,13 +32,22 @@ def settings_of(folder: Path) -> MazeConfig:
     return replace(cfg, threads=1, physics="mujoco", device="auto", resume=None)
 
 
-def world_of(folder: Path, num_envs: int, threads: int = 1) -> tuple[MazeConfig, GoalEnv]:
+def world_of(
+    folder: Path, num_envs: int, threads: int = 1, horizon: int | None = None
+) -> tuple[MazeConfig, GoalEnv]:
     """The settings of a run and simulations of its world, by so many threads (0: one per core).
+
+    Args:
+        folder: the run folder.
+        num_envs, threads: of the simulations.
+        horizon: steps of an episode; None: as many as in the run.
 
     Raises:
         RunError: if the folder is no run of a maze.
     """
     cfg = replace(settings_of(folder), threads=threads)
+    if horizon is not None:
+        cfg = replace(cfg, horizon=horizon)
     return cfg, make_env(cfg, num_envs, maze_of(folder))
 
 
