@@ -32,9 +32,9 @@ class StudyConfig:
 
     study: tyro.conf.Positional[str]
     """A TOML file, or one of those that come along: point_umaze, point_umaze_again, point_parts,
-    ant_umaze, ant_umaze_again, point_nd, ablations, four_rooms, four_rooms_ablations,
-    locomotion_trpo, locomotion_sac, locomotion_sac_again, locomotion_lengths, locomotion_forward,
-    locomotion_random, locomotion_updates."""
+    ant_umaze, ant_umaze_again, long_ways, long_ways_point, official, point_nd, ablations,
+    four_rooms, four_rooms_ablations, locomotion_trpo, locomotion_sac, locomotion_sac_again,
+    locomotion_lengths, locomotion_forward, locomotion_random, locomotion_updates."""
     out: Path = Path("docs/studies")
     """Where tables and report go, in a folder with the study's name."""
     runs: Path = Path("runs/studies")
