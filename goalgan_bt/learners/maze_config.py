@@ -156,6 +156,9 @@ def preset(env: str, method: str | None = None) -> MazeConfig:
     if env not in envs.NAMES:
         raise UsageError(f"unknown environment {env!r}: choose one of {', '.join(envs.NAMES)}")
     cfg = replace(ANT if env.startswith("ant") else POINT, env=env)
+    if env == "ant_large":  # many and long ways take more steps, and measuring them more time
+        measured = replace(cfg.coverage, every=10_000_000)
+        cfg = replace(cfg, total_steps=20_000_000, coverage=measured)
     if env == "point_nd":
         # The box is 0.6 m thin: among its neighbours' outcomes a goal's own is lost, and noise
         # throws it out of the box. No walls to be misled by: `near` is not needed.
