@@ -22,6 +22,7 @@ from goalgan_bt.learners.table import load
 from goalgan_bt.learners.trained_policy import world_of
 from goalgan_bt.recall.places import Places
 from goalgan_bt.runs import checkpoint
+from goalgan_bt.runs.errors import RunError
 from goalgan_bt.runs.metrics_csv import read_metrics
 
 
@@ -42,6 +43,8 @@ class Config:
 
 
 def main(cfg: Config) -> None:
+    if len(cfg.runs) < 2 or cfg.iterations < 5:
+        raise SystemExit("give two run folders or more, and at least 5 iterations")
     rows = [{"env": load(run).env, "places": places(run)} for run in cfg.runs]
     for row in rows:
         row["steps_per_second"] = []
@@ -90,4 +93,7 @@ def speed(run: Path, cfg: Config) -> float:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except RunError as error:
+        raise SystemExit(str(error)) from None

@@ -41,7 +41,10 @@ class Config:
 
 def main(cfg: Config) -> None:
     rows = []
-    for end in sorted(cfg.runs.rglob(ENDED)):
+    ended = sorted(cfg.runs.rglob(ENDED))
+    if not ended:
+        raise SystemExit(f"{cfg.runs} holds no finished run: python -m goalgan_bt.study official")
+    for end in ended:
         run = end.parent
         settings = load(run)
         if settings.env not in IDS:

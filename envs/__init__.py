@@ -28,7 +28,7 @@ def make(
     threads: int = 0,
     horizon: int | None = None,
     action_repeat: int = 1,
-    integrator: str = "implicitfast",
+    integrator: str | None = None,
     dim: int = 2,
     cell_size: float = 2.0,
     map_file: Path | None = None,
@@ -44,7 +44,8 @@ def make(
         threads: simulation threads, 0 for one per core.
         horizon: steps of an episode; None: 200 (point) or 500 (Ant), more in longer mazes.
         action_repeat: steps for which each action is held.
-        integrator: `implicitfast`, `rk4` or the body's `own`, for MuJoCo bodies.
+        integrator: `implicitfast`, `rk4` or the body's `own`, for MuJoCo bodies; None: `own` in
+            official tasks, else `implicitfast`.
         dim: dimensions of `point_nd`, 2 to 6.
         cell_size: side of a cell of a maze, metres.
         map_file: a text map that replaces the layout (see `goalgan_bt.envs.maze`).
@@ -55,7 +56,7 @@ def make(
     Raises:
         ValueError: for an unknown name or a dim out of range.
         PhysicsError: for `warp` where there is none (see `goalgan_bt.envs.warp_batch`).
-        MapError: for a map that is not a maze.
+        MapError: for a map that is not a maze, or that is too narrow for the body.
     """
     mine = own.find(name)
     if mine is None and name not in NAMES:
@@ -76,7 +77,7 @@ def make(
         return PointND(dim, num_envs, horizon or 200, action_repeat)
     how = action_repeat, threads, physics, device
     if name in OFFICIAL:
-        return official.make(name, maze, integrator, num_envs, horizon, *how)
+        return official.make(name, maze, integrator or "own", num_envs, horizon, *how)
     make_body: Any
     if mine is None:
         body, layout = name.split("_")
@@ -97,8 +98,12 @@ def make(
         maze = mazes.Maze(named.rows, cell_size)
     if horizon is None:
         horizon = _horizon(HORIZON[body] if mine is None else make_body.usual_horizon, maze)
-    settings = maze, integrator, num_envs, horizon, *how
+    settings = maze, integrator or "implicitfast", num_envs, horizon, *how
     env = make_body(*settings) if mine is None else own.made(name, make_body, *settings)
+    if mine is None and not env.valid(env.start_state[None])[0]:
+        raise mazes.MapError(
+            f"the {body} does not fit into cells of {maze.cell_size:g} m: make them larger"
+        )
     env.name = f"{body}_{layout if map_file is None else map_file.stem}"
     return env
 

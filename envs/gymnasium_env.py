@@ -34,7 +34,7 @@ class Rules:
         name: of the environment, as `--env` takes it.
         num_envs, threads: simulations and their threads.
         render_mode: one of the metadata's, or None.
-        map_file, horizon, action_repeat, integrator, dim: see `goalgan_bt.envs.make`.
+        map_file, horizon, action_repeat, integrator, dim, cell_size: see `goalgan_bt.envs.make`.
         map_rows: a map's rows, top row first, in the place of its file: what is written into a
             data set holds on other machines too.
         width, height: of pictures, pixels.
@@ -59,8 +59,9 @@ class Rules:
         map_rows: Sequence[str] | None = None,
         horizon: int | None = None,
         action_repeat: int = 1,
-        integrator: str = "implicitfast",
+        integrator: str | None = None,
         dim: int = 2,
+        cell_size: float = 2.0,
         width: int = FRAME,
         height: int = FRAME,
     ) -> None:
@@ -76,7 +77,7 @@ class Rules:
                 raise ValueError(
                     f"{setting} must be a whole number from {least} on, not {number!r}"
                 )
-        if integrator not in INTEGRATORS:
+        if integrator is not None and integrator not in INTEGRATORS:
             raise ValueError(f"integrator is {' or '.join(INTEGRATORS)}, not {integrator!r}")
         modes = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in modes:
@@ -88,11 +89,12 @@ class Rules:
             num_envs,
             threads=threads,
             map_file=None if map_file is None else Path(map_file),
-            maze=None if map_rows is None else Maze(tuple(map_rows)),
+            maze=None if map_rows is None else Maze(tuple(map_rows), cell_size),
             horizon=horizon,
             action_repeat=action_repeat,
             integrator=integrator,
             dim=dim,
+            cell_size=cell_size,
         )
         if render_mode is not None and not hasattr(self.sims, "model"):
             raise ValueError(f"{name} is no MuJoCo model: it has no pictures")

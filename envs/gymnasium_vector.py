@@ -33,7 +33,8 @@ class GoalVectorEnv(Rules, gymnasium.vector.VectorEnv[Obs, NDArray[np.float32], 
             another: with the next step (Gymnasium's default), with the same (`final_obs` and
             `final_info` tell how it ended), or when `reset` is asked to.
         threads: simulation threads, 0 for one per core. Results do not depend on it.
-        settings: map_file, horizon, action_repeat, integrator, dim, width, height: see `Rules`.
+        settings: map_file, horizon, action_repeat, integrator, dim, cell_size, width, height: see
+            `Rules`.
 
     Raises:
         ValueError: for an environment or settings that there are not.

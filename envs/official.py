@@ -2,9 +2,11 @@
 
 Cells of 4 m (Ant) or 1 m (point), success within 0.45 m, steps of 0.01 s with the integrators of
 the official models (RK4, Euler), of which the Ant holds an action for five; no fall ends an
-episode. Many at once, and bit for bit what the official environment does from the same state. There
-episodes begin anywhere; here, where the policy shall learn to reach all places from one, they begin
-in the first free cell of the map as it is written.
+episode. Many at once, and bit for bit what the official environment does from the same state.
+
+Two things differ, for learning. Official episodes begin anywhere; here, where the policy shall
+learn to reach all places from one, they begin in the first free cell of the map as it is written.
+And an official episode goes on after success, while here success ends it.
 """
 
 import importlib.util

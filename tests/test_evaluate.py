@@ -91,13 +91,28 @@ def test_the_seconds_of_a_step_are_those_of_the_environment(folder):
         assert evaluation.step_seconds(gymnasium.make(name), body) == pytest.approx(seconds)
 
 
+def test_another_maze_is_told(folder):
+    """A policy goes by the ways of its own maze."""
+    for name, other in (("goalgan_bt/PointSpiral-v0", True), ("goalgan_bt/PointUMaze-v0", False)):
+        done = call("evaluate", folder, "--on", name, "--episodes", 1)
+        assert done.returncode == 0 and ("another maze than the run" in done.stderr) == other
+    done = call(
+        "evaluate", folder, "--on", "gymnasium_robotics:PointMaze_UMaze-v3", "--episodes", 1
+    )
+    assert done.returncode == 0 and len(done.stderr.splitlines()) == 1  # cells of 1 m
+
+
 @pytest.mark.parametrize(
     ("words", "problem"),
     [
         (["--episodes", "0"], "--episodes must be between 1 and 1000000, not 0"),
         (["--on", "Nothing-v9"], "--on Nothing-v9: "),
-        (["--on", "CartPole-v1"], "it must tell goals and the 4 numbers of the body's state"),
-        (["--on", "goalgan_bt/AntUMaze-v0"], "the 4 numbers of the body's state"),
+        (["--on", "CartPole-v1"], "its actions are of shape ()"),
+        (["--on", "Pusher-v5"], "the run's body takes 2 numbers"),
+        (["--on", "Reacher-v5"], "it must tell goals and the 4 numbers of the body's state"),
+        (["--on", "goalgan_bt/AntUMaze-v0"], "the run's body takes 2 numbers"),
+        (["--on", "AntMaze_UMaze-v5"], "the run's body takes 2 numbers"),
+        (["--on", "PointMaze_UMaze-v99"], "--on PointMaze_UMaze-v99: "),
         (["--json", "/nowhere/x.json"], "cannot write '/nowhere/x.json'"),
         (["--horizon", "50"], "--horizon must be a multiple of the run's 4 steps"),
         (["--on", "PointMaze_UMaze-v3", "--horizon", "40"], "--horizon: an environment given with"),

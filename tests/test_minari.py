@@ -111,7 +111,7 @@ def test_it_tells_who_made_it_how_and_no_path(trained, place):
     assert str(trained.parent) not in text and str(place) not in text
 
 
-@pytest.mark.parametrize("words", ["--env point_nd --dim 3", "--map {map} --horizon 40"])
+@pytest.mark.parametrize("words", ["--env point_nd --dim 3", "--map {map} --horizon 40 --cell-size 1"])
 def test_boxes_and_mazes_of_ones_own(tmp_path, words):
     rows, folder = ["#####", "#S..#", "#.#.#", "#####"], tmp_path / "run"
     (tmp_path / "my.txt").write_text("\n".join(rows) + "\n")
@@ -129,7 +129,8 @@ def test_boxes_and_mazes_of_ones_own(tmp_path, words):
     if cfg.map is None:
         assert data.observation_space["achieved_goal"].shape == (3,)
     else:
-        assert [*sims.maze.rows] == rows and "my.txt" not in str(data.storage.metadata)
+        assert [*sims.maze.rows] == rows and sims.maze.cell_size == 1
+        assert "my.txt" not in str(data.storage.metadata)
 
 
 @pytest.mark.parametrize(

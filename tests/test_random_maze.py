@@ -43,6 +43,18 @@ def test_cells_of_another_size_make_ways_and_episodes_longer(name):
     assert wide.feasible(np.array([[8.0, 8.0]])).all()
 
 
+def test_a_body_must_fit_into_a_cell(tmp_path):
+    with pytest.raises(mazes.MapError, match=r"the ant does not fit into cells of 1 m"):
+        envs.make("ant_umaze", 1, threads=1, cell_size=1.0)
+    envs.make("ant_umaze", 1, threads=1, cell_size=1.5)
+    envs.make("point_umaze", 1, threads=1, cell_size=0.5)
+    done = call("train", "--env", "ant_umaze", "--cell-size", 0.5, "--out", tmp_path)
+    assert done.returncode == 2 and "does not fit into cells of 0.5 m" in done.stderr
+    assert len(done.stderr.splitlines()) == 1 and not list(tmp_path.iterdir())
+    done = call("train", "--env", "point_umaze", "--action-repeat", 7, "--out", tmp_path)
+    assert done.returncode == 2 and "does not divide the 200 steps" in done.stderr
+
+
 def test_a_run_records_its_cells_and_goes_on_in_them(tmp_path):
     words = "--env", "point_umaze", "--viz", "none", "--out", tmp_path, "--threads", 1
     small = "--rollout.num-envs", 16, "--rollout.steps", 20, "--coverage.rollouts", 1

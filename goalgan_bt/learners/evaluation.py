@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,10 +13,11 @@ from scipy import stats
 
 from goalgan_bt.agent.coverage import attempts
 from goalgan_bt.envs.goal_env import GoalEnv
-from goalgan_bt.envs.maze import BoolArray, FloatArray
+from goalgan_bt.envs.maze import BoolArray, FloatArray, Maze
 from goalgan_bt.learners.maze_learner import load_policy
 from goalgan_bt.learners.trained_policy import TrainedPolicy, world_of
 from goalgan_bt.runs.errors import UsageError
+from goalgan_bt.runs.terminal import complain
 
 SIDE_BY_SIDE = 512  # simulations
 PER_GOAL = 3  # episodes for each test goal where no number is given
@@ -95,20 +97,9 @@ def elsewhere(
         RunError: as `at_home`.
         UsageError: for an environment that there is not, or in which it cannot act.
     """
-    import gymnasium
-
-    import goalgan_bt.gym  # noqa: F401  (its ids)
-
     policy = TrainedPolicy(folder, seed)
-    if name.startswith(("AntMaze", "PointMaze")):
-        with contextlib.redirect_stderr(io.StringIO()):  # a notice about other environments
-            import gymnasium_robotics
-
-        gymnasium.register_envs(gymnasium_robotics)
-    try:
-        env: Any = gymnasium.make(name)
-    except Exception as error:  # each package has its own
-        raise UsageError(f"--on {name}: {error}") from None
+    name = name.removeprefix("gymnasium_robotics:")
+    env = made(name, policy.env)
     n = ON if episodes is None else episodes
     done = Attempted(np.zeros(n, bool), np.zeros(n, bool), np.zeros(n))
     returns = np.zeros(n)
@@ -117,7 +108,7 @@ def elsewhere(
     try:
         for i in range(n):
             obs, _ = env.reset(seed=seed + i)
-            ended, action, actions = False, np.zeros(0), 0
+            ended, action, actions = False, np.zeros(0), 0  # some go on after success
             while not ended:
                 if actions % repeat == 0:
                     state = state_of(obs, policy.env, name)
@@ -127,15 +118,66 @@ def elsewhere(
                 )
                 actions += 1
                 returns[i] += reward
-                success = bool(info.get("success", info.get("is_success", False)))
-                done.success[i] |= success
-                ended = terminated or truncated or success
-                done.fell[i] = terminated and not success
-            done.seconds[i] = actions * duration
+                if not done.success[i]:
+                    done.success[i] = info.get("success", info.get("is_success", False))
+                    done.seconds[i] = actions * duration
+                ended = terminated or truncated
+                done.fell[i] = terminated and not done.success[i]
     finally:
         env.close()
     found = {"run": str(folder), "iteration": policy.iteration, "world": name}
     return found | told(done, deterministic, seed) | {"return": float(returns.mean())}
+
+
+def made(name: str, body: GoalEnv) -> Any:
+    """The environment of Gymnasium's of that name, for a body.
+
+    Raises:
+        UsageError: if there is none, or its actions are another body's.
+    """
+    import gymnasium
+
+    import goalgan_bt.gym  # noqa: F401  (its ids)
+
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stderr(io.StringIO()):
+            warnings.simplefilter("ignore")  # of newer versions, and about other environments
+            if name.startswith(("AntMaze", "PointMaze")):
+                import gymnasium_robotics
+
+                gymnasium.register_envs(gymnasium_robotics)
+            env: Any = gymnasium.make(name)
+    except Exception as error:  # each package has its own
+        said = str(error).splitlines() or [type(error).__name__]
+        raise UsageError(f"--on {name}: {said[0]}") from None
+    if env.action_space.shape != (body.act_dim,):
+        env.close()
+        raise UsageError(
+            f"--on {name}: its actions are of shape {env.action_space.shape}, and the run's body "
+            f"takes {body.act_dim} numbers: choose an environment of the same body"
+        )
+    cells = cells_of(env)
+    if cells is not None and body.maze is not None and cells != cells_of(body):
+        complain(
+            f"{name} has another maze than the run: the policy goes by the ways of its own",
+            "warning",
+        )
+    return env
+
+
+def cells_of(env: Any) -> set[tuple[float, ...]] | None:
+    """The middles of the free cells, in gymnasium-robotics' mazes or ours; None where no maze is
+    known."""
+    inner = getattr(env, "unwrapped", env)
+    maze: Any = getattr(getattr(inner, "sims", inner), "maze", None)
+    if isinstance(maze, Maze):
+        centres = maze.cell_centres()
+    elif hasattr(maze, "maze_map"):
+        free = [(r, c) for r, row in enumerate(maze.maze_map) for c, x in enumerate(row) if x != 1]
+        centres = np.array([maze.cell_rowcol_to_xy(np.array(cell)) for cell in free])
+    else:
+        return None
+    return {tuple((np.round(place, 6) + 0.0).tolist()) for place in centres}
 
 
 def step_seconds(env: Any, body: GoalEnv) -> float:

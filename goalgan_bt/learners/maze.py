@@ -139,6 +139,11 @@ def prepared(cfg: MazeConfig) -> Iterator[World]:
     try:
         envs_per_rank(cfg)  # or there will be no run
         env = make_env(cfg, 1)
+        if env.horizon % cfg.action_repeat:
+            raise UsageError(
+                f"--action-repeat {cfg.action_repeat} does not divide the {env.horizon} steps of "
+                "an episode: give another, or --horizon"
+            )
         set_states = cfg.rollout.chain > 0 or cfg.imitation.source in ("traces", "forward")
         if set_states and not env.settable:
             raise UsageError(

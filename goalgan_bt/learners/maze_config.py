@@ -56,7 +56,8 @@ class MazeConfig(RunConfig):
     dim: Annotated[int, Range("2 to 6", 2, 6)] = 2
     """Dimensions of point_nd, 2 to 6."""
     horizon: Annotated[int | None, between(1, 10**6)] = None
-    """Steps of an episode; by default 200 (point) or 500 (ant), more in longer mazes."""
+    """Steps of an episode; by default 200 (point) or 500 (ant), more in longer mazes, and the
+    official number in official tasks (..._gym)."""
     integrator: Literal["implicitfast", "rk4", "own"] = "implicitfast"
     """MuJoCo's integrator; rk4 is the original's and costs four times as much; own is that of the
     body's model, which the official tasks (..._gym) have."""
@@ -65,7 +66,8 @@ class MazeConfig(RunConfig):
     device: str = "auto"
     """Where mujoco-warp runs: cpu, cuda, cuda:1, ...; auto is a GPU where there is one."""
     action_repeat: Annotated[int, between(1, 1000)] = 1
-    """Steps of 0.02 s for which the policy holds each action (the original: 1)."""
+    """Steps for which the policy holds each action (the original: 1); one is 0.02 s, in official
+    tasks 0.05 s (ant) or 0.01 s (point)."""
     threads: Annotated[int, NOT_NEGATIVE] = 0
     """Simulation threads of each process; 0 is one per core."""
     learning_threads: Annotated[int, ABOVE_ZERO] = 1

@@ -57,6 +57,11 @@ def record(folder: Path, name: str, episodes: int, deterministic: bool, seed: in
             f"{folder} is a run of {made_in}: --minari goes with the mazes and boxes that come "
             "along, which Gymnasium can make again elsewhere"
         )
+    if made_in in envs.OFFICIAL:
+        raise UsageError(
+            f"{folder} is a run of {made_in}, whose environment is gymnasium-robotics' own: "
+            "--minari goes with the mazes and boxes that come along"
+        )
     policy = TrainedPolicy(folder, seed)
     env = environment(folder, policy)
     tried = [attempt(env, policy, seed + i, deterministic) for i in range(episodes)]
@@ -110,6 +115,8 @@ def environment(folder: Path, policy: TrainedPolicy) -> Any:
         settings["integrator"] = cfg.integrator
         if world.maze.rows != mazes.layout(cfg.env.split("_")[1]).rows:
             settings["map_rows"] = list(world.maze.rows)
+        if world.maze.cell_size != mazes.Maze.cell_size:
+            settings["cell_size"] = world.maze.cell_size
     return gymnasium.make(goalgan_bt.gym.env_id(cfg.env), **settings)
 
 
