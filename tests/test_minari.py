@@ -111,7 +111,9 @@ def test_it_tells_who_made_it_how_and_no_path(trained, place):
     assert str(trained.parent) not in text and str(place) not in text
 
 
-@pytest.mark.parametrize("words", ["--env point_nd --dim 3", "--map {map} --horizon 40 --cell-size 1"])
+@pytest.mark.parametrize(
+    "words", ["--env point_nd --dim 3", "--map {map} --horizon 40 --cell-size 1"]
+)
 def test_boxes_and_mazes_of_ones_own(tmp_path, words):
     rows, folder = ["#####", "#S..#", "#.#.#", "#####"], tmp_path / "run"
     (tmp_path / "my.txt").write_text("\n".join(rows) + "\n")
