@@ -44,8 +44,7 @@ def make(
         threads: simulation threads, 0 for one per core.
         horizon: steps of an episode; None: 200 (point) or 500 (Ant), more in longer mazes.
         action_repeat: steps for which each action is held.
-        integrator: `implicitfast`, `rk4` or the body's `own`, for MuJoCo bodies; None: `own` in
-            official tasks, else `implicitfast`.
+        integrator: `implicitfast`, `rk4` or the body's `own`; None: `own` in official tasks only.
         dim: dimensions of `point_nd`, 2 to 6.
         cell_size: side of a cell of a maze, metres.
         map_file: a text map that replaces the layout (see `goalgan_bt.envs.maze`).
@@ -100,11 +99,19 @@ def make(
         horizon = _horizon(HORIZON[body] if mine is None else make_body.usual_horizon, maze)
     settings = maze, integrator or "implicitfast", num_envs, horizon, *how
     env = make_body(*settings) if mine is None else own.made(name, make_body, *settings)
-    if mine is None and not env.valid(env.start_state[None])[0]:
-        raise mazes.MapError(
-            f"the {body} does not fit into cells of {maze.cell_size:g} m: make them larger"
-        )
     env.name = f"{body}_{layout if map_file is None else map_file.stem}"
+    return env if mine else _standing(env, body)
+
+
+def _standing(env: Any, body: str) -> Any:
+    """The same environment, unless its cells are too narrow for the body to stand in.
+
+    Raises:
+        MapError: saying how wide they are.
+    """
+    if not env.valid(env.start_state[None])[0]:
+        side = env.maze.cell_size
+        raise mazes.MapError(f"the {body} does not fit into cells of {side:g} m: make them larger")
     return env
 
 
