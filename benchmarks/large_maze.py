@@ -14,15 +14,14 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
 
 from goalgan_bt.learners.table import load
-from goalgan_bt.learners.trained_policy import world_of
-from goalgan_bt.recall.places import Places
-from goalgan_bt.runs import checkpoint
-from goalgan_bt.runs.errors import RunError
+from goalgan_bt.runs.command_line import parse, run_command
+from goalgan_bt.runs.errors import UsageError
 from goalgan_bt.runs.metrics_csv import read_metrics
 
 
@@ -42,12 +41,22 @@ class Config:
     """Where to write the rows."""
 
 
-def main(cfg: Config) -> None:
+def main() -> None:
+    """Measure and print.
+
+    Raises:
+        UsageError, RunError: saying what is wrong.
+    """
+    cfg = parse(Config, None, "python benchmarks/large_maze.py")
     if len(cfg.runs) < 2 or cfg.iterations < 5:
-        raise SystemExit("give two run folders or more, and at least 5 iterations")
-    rows = [{"env": load(run).env, "places": places(run)} for run in cfg.runs]
-    for row in rows:
-        row["steps_per_second"] = []
+        raise UsageError("give two run folders or more, and at least 5 iterations")
+    rows: list[dict[str, Any]] = []
+    for run in cfg.runs:
+        _, reports = read_metrics(run)
+        if not reports or "places/known" not in reports[-1]:
+            raise UsageError(f"{run} has no report of a maze: name finished runs of mazes")
+        known = int(reports[-1]["places/known"])
+        rows.append({"env": load(run).env, "places": known, "steps_per_second": []})
     for _ in range(cfg.rounds):
         for run, row in zip(cfg.runs, rows, strict=True):
             row["steps_per_second"].append(round(speed(run, cfg)))
@@ -62,15 +71,6 @@ def main(cfg: Config) -> None:
         cfg.json.write_text(json.dumps(rows, indent=1) + "\n")
 
 
-def places(run: Path) -> int:
-    """How many places the agent of a run has been to."""
-    cfg, env = world_of(run, 1)
-    known = Places(env.goal_low, env.goal_high, env.success_radius, cfg.places)
-    with checkpoint.saved(run) as state:
-        known.load_state_dict(state["learner"]["places"])
-    return len(known)
-
-
 def speed(run: Path, cfg: Config) -> float:
     """Steps/s of a run that goes on, in a copy of its folder."""
     with tempfile.TemporaryDirectory() as directory:
@@ -83,7 +83,7 @@ def speed(run: Path, cfg: Config) -> float:
         words += ["--coverage.rollouts", "1"]
         done = subprocess.run(words, capture_output=True, text=True)
         if done.returncode:
-            raise SystemExit(done.stderr)
+            raise UsageError(done.stderr.strip())
         _, rows = read_metrics(copy)
         first, last = (
             {name: float(rows[i][name]) for name in ("steps/train", "time/total")}
@@ -93,7 +93,4 @@ def speed(run: Path, cfg: Config) -> float:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except RunError as error:
-        raise SystemExit(str(error)) from None
+    sys.exit(run_command(main))

@@ -7,6 +7,7 @@ Each finished run of the study acts in 100 episodes, with its noise. Its trainin
 """
 
 import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,8 @@ import tyro
 
 from goalgan_bt.learners import evaluation
 from goalgan_bt.learners.table import load
+from goalgan_bt.runs.command_line import parse, run_command
+from goalgan_bt.runs.errors import UsageError
 from goalgan_bt.runs.metrics_csv import read_metrics
 from goalgan_bt.runs.run_folder import ENDED
 
@@ -39,16 +42,21 @@ class Config:
     """Where to write the rows."""
 
 
-def main(cfg: Config) -> None:
-    rows = []
-    ended = sorted(cfg.runs.rglob(ENDED))
-    if not ended:
-        raise SystemExit(f"{cfg.runs} holds no finished run: python -m goalgan_bt.study official")
-    for end in ended:
-        run = end.parent
-        settings = load(run)
-        if settings.env not in IDS:
-            continue
+def main() -> None:
+    """Try them and print.
+
+    Raises:
+        UsageError, RunError: saying what is wrong.
+    """
+    cfg, rows = parse(Config, None, "python benchmarks/official.py"), []
+    runs = [(end.parent, load(end.parent)) for end in sorted(cfg.runs.rglob(ENDED))]
+    runs = [(run, settings) for run, settings in runs if settings.env in IDS]
+    if not runs:
+        raise UsageError(
+            f"{cfg.runs} holds no finished run in an official maze: python -m goalgan_bt.study "
+            "official makes some"
+        )
+    for run, settings in runs:
         found = evaluation.elsewhere(run, IDS[settings.env], cfg.episodes, False, 0)
         *_, last = read_metrics(run)[1]
         row = {
@@ -70,4 +78,4 @@ def main(cfg: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    sys.exit(run_command(main))

@@ -25,7 +25,6 @@ from goalgan_bt.envs.random_maze import random_maze
 from goalgan_bt.runs.metrics_csv import read_metrics
 
 RUNS = Path(__file__).parents[1] / "docs/runs"
-STEPS = {"point": 1_000_000, "ant": 1_000_000}
 ALONE = os.environ | {"OMP_NUM_THREADS": "1"}
 # Rooms, with a cell between two of them: 3 x 3 to 9 x 9 cells.
 SIZES = (2, 2), (2, 3), (2, 4), (2, 5), (3, 3), (3, 4), (3, 5), (4, 4), (4, 5), (5, 5)
@@ -39,8 +38,8 @@ class RandomConfig:
     """The body."""
     mazes: int = 20
     """How many."""
-    steps: int | None = None
-    """Environment steps of training in each; by default 1 million."""
+    steps: int = 1_000_000
+    """Environment steps of training in each."""
     processes: int = 0
     """Runs at a time, of one simulation thread each; 0 is one per core."""
     json: Path | None = None
@@ -74,7 +73,6 @@ def row_of(cfg: RandomConfig, i: int, directory: Path) -> dict[str, Any]:
 
 def trained(cfg: RandomConfig, maze: Path, out: Path) -> dict[str, float]:
     """Coverage in a maze before and after training, and what that took."""
-    steps = cfg.steps or STEPS[cfg.env]
     words = [sys.executable, "-m", "goalgan_bt.train", "--env", f"{cfg.env}_umaze", "--viz", "none"]
     words += ["--map", str(maze), "--out", str(out), "--threads", "1"]
     words += ["--coverage.every", str(10**9)]
@@ -82,7 +80,7 @@ def trained(cfg: RandomConfig, maze: Path, out: Path) -> dict[str, float]:
         words += ["--coverage.rollouts", "1"]
     first = ["--iterations", "1", "--trpo.max-kl", "1e-9"]  # learns next to nothing
     found = {}
-    for name, more in (("untrained", first), ("trained", ["--total-steps", str(steps)])):
+    for name, more in (("untrained", first), ("trained", ["--total-steps", str(cfg.steps)])):
         done = subprocess.run([*words, *more], capture_output=True, text=True, env=ALONE)
         if done.returncode:
             raise SystemExit(done.stderr)
@@ -101,7 +99,7 @@ def draw(path: Path) -> None:
 
     figure = Figure(figsize=(6, 3.6), layout="constrained")
     ax = figure.subplots()
-    for i, body in enumerate(STEPS):
+    for i, body in enumerate(("point", "ant")):
         known = RUNS / f"random_mazes_{body}.json"
         if not known.exists():
             continue

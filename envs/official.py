@@ -105,7 +105,7 @@ class OfficialAnt(AntMaze):
         self.start_state[:2] = self.maze.start
 
     def test_goals(self) -> FloatArray:
-        return self.maze.tiles(self.maze.cell_size / 4)  # 16 of a cell, as where cells are smaller
+        return self.maze.tiles(self.maze.cell_size / 4)  # 16 of a cell, as of one of 2 m
 
 
 class OfficialPoint(PointMaze):

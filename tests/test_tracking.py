@@ -52,9 +52,7 @@ def test_the_metrics_of_a_run_and_of_what_goes_on_with_it(tmp_path, monkeypatch)
     more = "--iterations", 6, "--viz", "none", "--track"  # the folder does not decide it
     assert call("train", "--resume", folder, *more).returncode == 0
     config, rows = written(folder)
-    deadline = (
-        time.monotonic() + 30
-    )  # it writes in a process of its own, which a busy machine delays
+    deadline = time.monotonic() + 30  # W&B writes in a process of its own, which may be late
     while len(rows) < 6 and time.monotonic() < deadline:
         time.sleep(0.5)
         config, rows = written(folder)

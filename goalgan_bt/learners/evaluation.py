@@ -108,7 +108,7 @@ def elsewhere(
     try:
         for i in range(n):
             obs, _ = env.reset(seed=seed + i)
-            ended, action, actions = False, np.zeros(0), 0  # some go on after success
+            ended, action, actions = False, np.zeros(0), 0
             while not ended:
                 if actions % repeat == 0:
                     state = state_of(obs, policy.env, name)
@@ -118,7 +118,7 @@ def elsewhere(
                 )
                 actions += 1
                 returns[i] += reward
-                if not done.success[i]:
+                if not done.success[i]:  # some go on after success
                     done.success[i] = info.get("success", info.get("is_success", False))
                     done.seconds[i] = actions * duration
                 ended = terminated or truncated

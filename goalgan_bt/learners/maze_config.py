@@ -175,14 +175,14 @@ def preset(env: str, method: str | None = None) -> MazeConfig:
         )
     if env in envs.OFFICIAL:
         # A step of the Ant is 0.05 s there, one of the point 0.01 s.
-        repeat = 1 if env.startswith("ant") else 5
-        cfg = replace(cfg, integrator="own", action_repeat=repeat)
-        if env.startswith("ant"):  # the same seconds as ours; episodes are long, so try fewer
+        cfg = replace(cfg, integrator="own", action_repeat=5)
+        if env.startswith("ant"):  # the same seconds of patience; episodes are long, so try fewer
             cfg = replace(
                 cfg,
                 total_steps=6_000_000,
+                action_repeat=1,
                 rollout=replace(cfg.rollout, patience=120),
-                coverage=CoverageConfig(rollouts=1, every=2_000_000),
+                coverage=replace(cfg.coverage, rollouts=1),
             )
     return cfg if method is None else with_method(cfg, method)
 

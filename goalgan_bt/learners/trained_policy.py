@@ -45,9 +45,8 @@ def world_of(
     Raises:
         RunError: if the folder is no run of a maze.
     """
-    cfg = replace(settings_of(folder), threads=threads)
-    if horizon is not None:
-        cfg = replace(cfg, horizon=horizon)
+    cfg = settings_of(folder)
+    cfg = replace(cfg, threads=threads, horizon=horizon or cfg.horizon)
     return cfg, make_env(cfg, num_envs, maze_of(folder))
 
 
