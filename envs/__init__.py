@@ -42,7 +42,7 @@ def make(
         name: one of `NAMES`, or one's own (see `goalgan_bt.envs.own`).
         num_envs: N.
         threads: simulation threads, 0 for one per core.
-        horizon: steps of an episode; None: 200 (point) or 500 (Ant), more in longer mazes.
+        horizon: steps of an episode; None: 200 (point) or 500 (Ant), more in long or official mazes.
         action_repeat: steps for which each action is held.
         integrator: `implicitfast`, `rk4` or the body's `own`; None: `own` in official tasks only.
         dim: dimensions of `point_nd`, 2 to 6.

@@ -56,7 +56,7 @@ class MazeConfig(RunConfig):
     dim: Annotated[int, Range("2 to 6", 2, 6)] = 2
     """Dimensions of point_nd, 2 to 6."""
     horizon: Annotated[int | None, between(1, 10**6)] = None
-    """Steps of an episode; by default 200 (point) or 500 (ant), more in long, official mazes."""
+    """Steps of an episode; None: 200 (point) or 500 (ant), more in long or official mazes."""
     integrator: Literal["implicitfast", "rk4", "own"] = "implicitfast"
     """MuJoCo's integrator; rk4 is the original's and costs four times as much; own is that of the
     body's model, which the official tasks (..._gym) have."""

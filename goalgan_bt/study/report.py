@@ -270,7 +270,7 @@ def _ends(
         value, low, high = found.T
         x = np.array(there) + 0.04 * (i - len(methods) / 2)  # so that no bar hides another
         ax.errorbar(x, value, (value - low, high - value), label=method, capsize=3, **_style(i))
-    ax.set_xticks(range(len(envs)), envs)
+    ax.set_xticks(range(len(envs)), [env.replace(" --", "\n--") for env in envs])
     ax.set(title="at the end", ylabel="coverage")
     _finish(ax, "coverage")
 
